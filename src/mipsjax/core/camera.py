@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -42,3 +41,41 @@ class Intrinsics(NamedTuple):
         return Intrinsics(
             self.fx / every_px, self.fy / every_px, self.cx / every_px, self.cy / every_px, width, height
         )
+
+
+def pixel_grid(
+    rows: int, columns: int, shift: Float[Array, "2"], height: int, width: int
+) -> tuple[Int[Array, " P"], Int[Array, " P"]]:
+    """Rows v and columns u of a stripe grid over the image, P = rows * columns.
+
+    `shift` in [0, 1)^2 moves the whole grid within one cell, so that over many shifts every pixel is reached
+    (the paper samples 16 x 24 pixels of 480 x 640 this way).
+    """
+    v = jnp.floor((jnp.arange(rows) + shift[0]) * (height / rows)).astype(jnp.int32)
+    u = jnp.floor((jnp.arange(columns) + shift[1]) * (width / columns)).astype(jnp.int32)
+    v, u = jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)
+    return jnp.repeat(v, columns), jnp.tile(u, rows)
+
+
+def grid_shape(pixels: int, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of a grid of at most `pixels` cells, as square as the image allows."""
+    rows = max(1, int((pixels * height / width) ** 0.5))
+    return rows, max(1, pixels // rows)
+
+
+def rays(
+    v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
+) -> Float[Array, "P 3"]:
+    """Direction of each pixel with z = 1, camera frame: a point at depth d is d times the ray."""
+    return jnp.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, jnp.ones(u.shape)], -1)
+
+
+def transform(T_a_b: Float[Array, "4 4"], p_b: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
+    """Points from frame b to frame a."""
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def project(p_cam: Float[Array, "P 3"], camera: Intrinsics) -> Float[Array, "P 2"]:
+    """Pixel coordinates (u, v); points at or behind the camera give a large finite value."""
+    z = jnp.maximum(p_cam[:, 2], 1e-6)
+    return jnp.stack([camera.fx * p_cam[:, 0] / z + camera.cx, camera.fy * p_cam[:, 1] / z + camera.cy], -1)

@@ -1,0 +1,176 @@
+"""The neural field of one submap: truncated signed distance by classification, and colour.
+
+All points are in the submap's frame, metres. The distance is positive in front of the surface.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from mipsjax.config import FieldConfig
+
+Part = Literal["search", "whole"]
+
+# Multipliers of the spatial hash (Teschner et al. 2003): large primes, the first 1 for locality in memory.
+HASH_PRIMES = np.array([1, 2654435761, 805459861], np.uint32)
+CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], np.int32)
+TABLE_INIT = 1e-4
+
+
+class Net(NamedTuple):
+    """A multilayer perceptron, behind a hash grid where `table` is not None."""
+
+    weights: tuple[Float[Array, "I O"], ...]
+    biases: tuple[Float[Array, " O"], ...]
+    table: Float[Array, "L T F"] | None
+
+
+class Field(NamedTuple):
+    """Parameters of a submap; the same shapes for every submap of one config."""
+
+    smooth: Net | None
+    """Distance from sinusoids."""
+    fine: Net | None
+    """Distance from a hash grid."""
+    color: Net
+
+
+class Tsdf(NamedTuple):
+    """Prediction at N points."""
+
+    psi: Float[Array, " N"]
+    """Truncated signed distance, metres (Eq. 2)."""
+    entropy: Float[Array, " N"]
+    """Shannon entropy of the class distribution, nats; 1 everywhere where the distance is regressed."""
+    logits: Float[Array, "N C"]
+    """Logarithm of the class probabilities; C = 1, psi itself, where the distance is regressed."""
+
+
+def class_values(cfg: FieldConfig) -> Float[np.ndarray, " C"]:
+    """The distances the classes stand for, evenly over [-tau, tau]. Metres."""
+    return np.linspace(-cfg.truncation, cfg.truncation, cfg.classes, dtype=np.float32)
+
+
+def init(key: PRNGKeyArray, cfg: FieldConfig) -> Field:
+    """Fresh parameters: He initialisation, hash grid near zero."""
+    k_smooth, k_fine, k_color = jax.random.split(key, 3)
+    outputs = cfg.classes if cfg.classification else 1
+    smooth = fine = None
+    if cfg.encoding in ("frequency", "both"):
+        smooth = _init_net(k_smooth, (_frequency_width(cfg), *cfg.hidden, outputs))
+    if cfg.encoding in ("hash", "both"):
+        fine = _init_net(k_fine, (_hash_width(cfg), *cfg.hash_hidden, outputs), cfg)
+    if cfg.encoding == "frequency":
+        color = _init_net(k_color, (_frequency_width(cfg), *cfg.color_hidden, 3))
+    else:
+        color = _init_net(k_color, (_hash_width(cfg), *cfg.color_hidden, 3), cfg)
+    return Field(smooth, fine, color)
+
+
+def tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig, part: Part = "whole") -> Tsdf:
+    """Distance and its uncertainty (Section 3.1 of the paper).
+
+    `part="search"` is the smooth field where there are two; `whole` the most accurate one.
+    """
+    smooth = field.fine is None or (part == "search" and field.smooth is not None)
+    return smooth_tsdf(field, points, cfg) if smooth else fine_tsdf(field, points, cfg)
+
+
+def smooth_tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Tsdf:
+    """Distance from the sinusoidal field."""
+    assert field.smooth is not None
+    return _classify(_mlp(field.smooth, frequencies(points, cfg)), cfg)
+
+
+def fine_tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Tsdf:
+    """Distance from the hash-grid field."""
+    assert field.fine is not None and field.fine.table is not None
+    return _classify(_mlp(field.fine, hash_features(field.fine.table, points, cfg)), cfg)
+
+
+def color(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N 3"]:
+    """RGB in 0..1."""
+    if field.color.table is None:
+        encoded = frequencies(points, cfg)
+    else:
+        encoded = hash_features(field.color.table, points, cfg)
+    return jax.nn.sigmoid(_mlp(field.color, encoded))
+
+
+def frequencies(points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N E"]:
+    """The points and sines and cosines of `octaves` frequencies (Mildenhall et al. 2021).
+
+    Only the first octave calls sin and cos; each further one is the double angle of the last:
+    sin 2a = 2 sin a cos a, cos 2a = 1 - 2 sin^2 a.
+    """
+    angle = points * (2 * np.pi / cfg.longest_wavelength)
+    sin, cos = jnp.sin(angle), jnp.cos(angle)
+    out = [points, sin, cos]
+    for _ in range(cfg.octaves - 1):
+        sin, cos = 2 * sin * cos, 1 - 2 * sin * sin
+        out += [sin, cos]
+    return jnp.concatenate(out, -1)
+
+
+def hash_features(
+    table: Float[Array, "L T F"], points: Float[Array, "N 3"], cfg: FieldConfig
+) -> Float[Array, "N E"]:
+    """Trilinearly interpolated features of every level (Mueller et al. 2022); no scene bounds are needed."""
+    return jnp.concatenate([_interpolate(table[i], points / size) for i, size in enumerate(_cells(cfg))], -1)
+
+
+def _interpolate(table: Float[Array, "T F"], cells: Float[Array, "N 3"]) -> Float[Array, "N F"]:
+    base = jnp.floor(cells)
+    offset = cells - base
+    corners = base.astype(jnp.int32)[:, None] + CORNERS
+    mixed = corners.astype(jnp.uint32) * HASH_PRIMES
+    index = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) & np.uint32(table.shape[0] - 1)
+    weight = jnp.prod(jnp.where(CORNERS == 1, offset[:, None], 1 - offset[:, None]), -1)
+    return jnp.sum(table[index.astype(jnp.int32)] * weight[..., None], 1)
+
+
+def _cells(cfg: FieldConfig) -> list[float]:
+    return np.geomspace(cfg.hash_coarsest, cfg.hash_finest, cfg.hash_levels).tolist()
+
+
+def _frequency_width(cfg: FieldConfig) -> int:
+    return 3 + 6 * cfg.octaves
+
+
+def _hash_width(cfg: FieldConfig) -> int:
+    return cfg.hash_levels * cfg.hash_features
+
+
+def _init_net(key: PRNGKeyArray, widths: tuple[int, ...], hashed: FieldConfig | None = None) -> Net:
+    keys = jax.random.split(key, len(widths))
+    pairs = list(zip(widths[:-1], widths[1:], strict=True))
+    weights = tuple(
+        jax.random.normal(k, pair) * np.float32(np.sqrt(2 / pair[0])) for k, pair in zip(keys[1:], pairs, strict=True)
+    )
+    biases = tuple(jnp.zeros(o) for _, o in pairs)
+    table = None
+    if hashed is not None:
+        shape = (hashed.hash_levels, 2**hashed.hash_log2_entries, hashed.hash_features)
+        table = jax.random.uniform(keys[0], shape, minval=-TABLE_INIT, maxval=TABLE_INIT)
+    return Net(weights, biases, table)
+
+
+def _mlp(net: Net, x: Float[Array, "N I"]) -> Float[Array, "N O"]:
+    for w, b in zip(net.weights[:-1], net.biases[:-1], strict=True):
+        x = jax.nn.relu(x @ w + b)
+    return x @ net.weights[-1] + net.biases[-1]
+
+
+def _classify(z: Float[Array, "N C"], cfg: FieldConfig) -> Tsdf:
+    if not cfg.classification:
+        psi = cfg.truncation * jnp.tanh(z[:, 0])
+        return Tsdf(psi, jnp.ones_like(psi), psi[:, None])
+    z = jax.nn.softmax(z) if cfg.normalised else z
+    log_p = jax.nn.log_softmax(cfg.coldness * z)
+    p = jnp.exp(log_p)
+    return Tsdf(p @ class_values(cfg), -jnp.sum(p * log_p, -1), log_p)

@@ -1,0 +1,202 @@
+"""Local bundle adjustment: the submap's networks and the poses of a few frames together.
+
+One entry point, `refine`, for the first fit, the active submap and the inactive ones.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+
+from mipsjax.config import Config
+from mipsjax.core import field as nf
+from mipsjax.core import losses, sampling
+from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
+
+
+class Submap(NamedTuple):
+    """The learned part of a submap; the same shapes for every submap of one config."""
+
+    field: nf.Field
+    optimizer: optax.OptState
+
+
+class Frames(NamedTuple):
+    """F posed frames of one size."""
+
+    depth: Float[Array, "F H W"]
+    """Metres, 0 for no measurement."""
+    color: UInt8[Array, "F H W 3"]
+    T_sub_cam: Float[Array, "F 4 4"]
+    movable: Bool[Array, " F"]
+    """Whether the pose is optimised; the anchor's is not."""
+
+
+class Pixels(NamedTuple):
+    """P pixels of one frame."""
+
+    ray: Float[Array, "P 3"]
+    depth: Float[Array, " P"]
+    slope: Float[Array, " P"]
+    color: Float[Array, "P 3"]
+
+
+class MapInfo(NamedTuple):
+    """What a call of `refine` did."""
+
+    loss: Float[Array, ""]
+    """Of the last step."""
+    ok: Bool[Array, ""]
+    """False: something was not finite, and everything was left as it was."""
+
+
+def optimizer(cfg: Config) -> optax.GradientTransformation:
+    """Adam on all networks."""
+    return optax.adam(cfg.map.learning_rate, b2=0.99)
+
+
+def create(key: PRNGKeyArray, cfg: Config) -> Submap:
+    """A submap that knows nothing."""
+    field = nf.init(key, cfg.field)
+    return Submap(field, optimizer(cfg).init(field))
+
+
+@partial(jax.jit, static_argnames=("camera", "cfg"))
+def refine(
+    submap: Submap, frames: Frames, steps: Int[Array, ""], key: PRNGKeyArray, camera: Intrinsics, cfg: Config
+) -> tuple[Submap, Float[Array, "F 4 4"], MapInfo]:
+    """`steps` steps of Adam on map and poses (Section 3.4 of the paper).
+
+    Returns the submap, the poses and an info; all as before where anything became infinite or NaN.
+    """
+    pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
+    loss_and_gradient = jax.value_and_grad(map_loss, argnums=(0, 1))
+
+    def step(i, carry):
+        field, state, twist, pose_state, _ = carry
+        poses = moved(frames, twist)
+        k = jax.random.fold_in(key, i)
+        loss, (g_field, g_twist) = loss_and_gradient(field, jnp.zeros_like(twist), poses, frames, k, camera, cfg)
+        change, state = optimizer(cfg).update(g_field, state, field)
+        pose_change, pose_state = pose_optimizer.update(g_twist, pose_state)
+        return optax.apply_updates(field, change), state, twist + pose_change, pose_state, loss
+
+    twist = jnp.zeros((frames.depth.shape[0], 6))
+    start = (submap.field, submap.optimizer, twist, pose_optimizer.init(twist), jnp.zeros(()))
+    field, state, twist, _, loss = jax.lax.fori_loop(0, steps, step, start)
+    ok = _finite((field, twist, loss))
+    submap = jax.tree.map(partial(jnp.where, ok), Submap(field, state), submap)
+    return submap, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
+
+
+def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
+    """Poses after a twist (v, omega) in each camera's own frame; those not movable stay."""
+    return perturb(frames.T_sub_cam, twist * frames.movable[:, None])
+
+
+def perturb(poses: Float[Array, "F 4 4"], twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
+    return poses @ jax.vmap(lambda t: jaxlie.SE3.exp(t).as_matrix())(twist)
+
+
+def map_loss(
+    field: nf.Field,
+    twist: Float[Array, "F 6"],
+    poses: Float[Array, "F 4 4"],
+    frames: Frames,
+    key: PRNGKeyArray,
+    camera: Intrinsics,
+    cfg: Config,
+) -> Float[Array, ""]:
+    """The mapping loss on one draw of pixels and samples of every frame (Eq. 16)."""
+    count = frames.depth.shape[0]
+    k_pixels, k_rays, k_surface = jax.random.split(key, 3)
+    pixels = jax.vmap(draw_pixels, (0, 0, 0, None, None))(
+        jax.random.split(k_pixels, count), frames.depth, frames.color, camera, cfg
+    )
+    flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), pixels)
+    poses = perturb(poses, twist * frames.movable[:, None])
+    per_frame = flat.depth.shape[0] // count
+    rotation, origin = jnp.repeat(poses[:, :3, :3], per_frame, 0), jnp.repeat(poses[:, :3, 3], per_frame, 0)
+    ray_sub = jnp.einsum("pij,pj->pi", rotation, flat.ray)
+
+    def at(depth):
+        return (origin[:, None] + depth[..., None] * ray_sub[:, None]).reshape(-1, 3)
+
+    tau = cfg.field.truncation
+    depth = sampling.first_phase(k_rays, flat.depth, tau, cfg.sample)
+    depth = sampling.second_phase(
+        k_surface, depth, lambda d: nf.tsdf(field, at(d), cfg.field).psi.reshape(d.shape), cfg.sample
+    )
+    samples = sampling.label(depth, flat.depth, flat.slope, tau)
+    points = at(depth)
+    total = jnp.zeros(())
+    psi = None
+    if field.smooth is not None:
+        prediction = nf.smooth_tsdf(field, points, cfg.field)
+        total += tsdf_loss(prediction, samples, cfg)
+        psi = prediction.psi
+    if field.fine is not None:
+        prediction = nf.fine_tsdf(field, points, cfg.field)
+        total += tsdf_loss(prediction, samples, cfg)
+        psi = prediction.psi
+    return total + cfg.loss.rgb * color_loss(field, psi, samples, flat, at, cfg)
+
+
+def tsdf_loss(prediction: nf.Tsdf, samples: sampling.Samples, cfg: Config) -> Float[Array, ""]:
+    target = samples.target.reshape(-1)
+    total = jnp.zeros(())
+    for weight, mask in ((cfg.loss.tr, samples.near), (cfg.loss.fs, samples.free)):
+        flat = mask.reshape(-1)
+        total += weight * losses.distance(prediction.psi, target, flat)
+        total += cfg.loss.emd * losses.emd(prediction, target, flat, cfg.field)
+        total += cfg.loss.cross_entropy * losses.cross_entropy(prediction, target, flat, cfg.field)
+    return total
+
+
+def color_loss(field, psi, samples, pixels, at, cfg) -> Float[Array, ""]:
+    n = cfg.loss.color_samples
+    near = samples.near[:, -n:]
+    psi = jax.lax.stop_gradient(psi.reshape(samples.depth.shape)[:, -n:])
+    weights = losses.render_weights(psi, near, cfg.field.truncation)
+    rgb = nf.color(field, at(samples.depth[:, -n:]), cfg.field).reshape(*near.shape, 3)
+    return losses.rgb(losses.render(weights, rgb), pixels.color, pixels.depth > 0)
+
+
+def draw_pixels(
+    key: PRNGKeyArray, depth: Float[Array, "H W"], color: UInt8[Array, "H W 3"], camera: Intrinsics, cfg: Config
+) -> Pixels:
+    """A stripe grid of pixels, shifted by a random part of a cell."""
+    height, width = depth.shape
+    v, u = pixel_grid(*grid_shape(cfg.map.pixels, height, width), jax.random.uniform(key, (2,)), height, width)
+    ray = rays(v, u, camera)
+    slope = surface_slope(depth, v, u, ray, camera) if cfg.sample.perpendicular else jnp.ones(u.shape)
+    return Pixels(ray, depth[v, u], slope, color[v, u].astype(jnp.float32) / 255)
+
+
+def surface_slope(depth, v, u, ray, camera, step: int = 2) -> Float[Array, " P"]:
+    """|n . ray| of the surface at each pixel, from central differences of the depth image."""
+    height, width = depth.shape
+
+    def point(dv, du):
+        vv, uu = jnp.clip(v + dv, 0, height - 1), jnp.clip(u + du, 0, width - 1)
+        d = depth[vv, uu]
+        return rays(vv, uu, camera) * d[:, None], d
+
+    (right, d_r), (left, d_l) = point(0, step), point(0, -step)
+    (down, d_d), (up, d_u) = point(step, 0), point(-step, 0)
+    normal = jnp.cross(right - left, down - up)
+    length = jnp.linalg.norm(normal, axis=-1)
+    slope = jnp.abs(jnp.sum(normal * ray, -1)) / jnp.maximum(length, 1e-12)
+    here = depth[v, u]
+    smooth = jnp.stack([jnp.abs(d - here) < 0.05 * here for d in (d_r, d_l, d_d, d_u)]).all(0)
+    return jnp.where(smooth & (length > 1e-9), jnp.clip(slope, 0.25, 1.0), 1.0)
+
+
+def _finite(tree) -> Bool[Array, ""]:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
