@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from mipsjax.errors import ConfigError
+
 Encoding = Literal["frequency", "hash", "both"]
 
 
@@ -38,11 +40,11 @@ class FieldConfig:
     classification: bool = True
     """Off: the distance is regressed (the paper's ablation "No C")."""
     classes: int = 5
-    coldness: float = 10.0
-    """beta of the soft argmax (Eq. 2)."""
-    normalised: bool = True
-    """The outputs z are normalised to sum to 1 before the soft argmax, as in the paper; without it, coldness 10
-    saturates the distribution at the start and the squared losses have no gradient."""
+    coldness: float = 1.0
+    """beta of the soft argmax (Eq. 2; paper: 10, on outputs that sum to 1)."""
+    normalised: bool = False
+    """The outputs z are normalised to sum to 1 before the soft argmax, as in the paper. Its two softmaxes in a
+    row saturate: the sinusoidal field then stays at one class (docs/method.md)."""
     octaves: int = 6
     longest_wavelength: float = 8.0
     """Metres, of the first octave; about the largest side of a submap."""
@@ -64,15 +66,15 @@ class FieldConfig:
 class SampleConfig:
     """Samples along each ray (paper: 20 + 20 + 10)."""
 
-    uniform: int = 8
+    uniform: int = 6
     """Over free space and the truncation region."""
-    truncation: int = 12
+    truncation: int = 10
     """Within the truncation region."""
     surface: int = 0
     """Around the sample with the smallest distance, in a second phase."""
     surface_spread: float = 0.05
     """Metres, half length of that second interval; the paper gives none."""
-    perpendicular: bool = True
+    perpendicular: bool = False
     """Targets are distances across the surface, by the normal of the depth image, not along the ray."""
 
 
@@ -83,12 +85,13 @@ class LossConfig:
     tr: float = 1000.0
     fs: float = 10.0
     rgb: float = 1.0
-    cross_entropy: float = 0.0
-    """Of the two-hot cross entropy in both regions; not in the paper."""
-    color_samples: int = 4
-    """Samples of the truncation region on each ray on which colour is rendered."""
     emd: float = 0.01
-    """Of both distribution terms, relative to tr and fs; the paper gives none, its released code has 0.01."""
+    """Of both distribution terms; the paper gives none, its released code has 0.01."""
+    cross_entropy: float = 3.0
+    """Of the two-hot cross entropy in both regions; not in the paper. Its gradient does not vanish where the
+    distribution is certain and wrong, which the squared terms' does: a new surface is learned in fewer steps."""
+    color_samples: int = 4
+    """Samples of the truncation region on each ray on which colour is rendered (paper: all)."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +100,36 @@ class MapConfig:
 
     steps: int = 8
     """Each frame, once a submap is initialised (paper: 15 in one place, 10 in another)."""
+    steps_slow: int = 8
+    """The same where the camera has hardly moved since the last frame; in between, in proportion to the motion."""
+    motion: float = 0.1
+    """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""
     first_steps: int = 200
     """On the anchor of a new submap (paper: 500)."""
     frames: int = 5
     """The current frame, the anchor, and randomly chosen keyframes."""
-    pixels: int = 200
+    pixels: int = 128
     """Of each frame in each step (paper: 384)."""
     learning_rate: float = 1e-2
     pose_learning_rate: float = 1e-3
     width_px: int = 160
     """Images are decimated to about this width for mapping; it bounds the memory of a keyframe."""
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """Which frames are kept."""
+
+    error: float = 0.05
+    """Metres; a pixel with a smaller error is known already."""
+    known: float = 0.65
+    """A frame with a smaller share of known pixels is a keyframe."""
+    every_frames: int = 1
+    """Least distance between two keyframes (paper: 30, which starves a fast camera)."""
+    translation: float = 0.15
+    """Metres of motion since the last keyframe that make one; not in the paper."""
+    rotation: float = 0.14
+    """Radians of motion since the last keyframe that make one; not in the paper."""
 
 
 @dataclass(frozen=True)
@@ -122,18 +145,22 @@ class SearchConfig:
     """First radius of the swarm in the imaginary part of the quaternion, half the angle in radians."""
     translation: float = 0.25
     """Metres, first radius of the swarm."""
+    widening: float = 1.5
+    """Factor on both radii for each weak or lost frame just before."""
+    widening_limit: float = 3.0
+    """Largest such factor."""
     momentum: float = 0.1
     """alpha of Eq. 14: the share of the last radii in the new ones."""
     epsilon: float = 1e-3
     """Smallest radius (Eq. 13)."""
+    uncertainty: bool = True
+    """Off: the fitness is not weighted (the paper's ablation "No U")."""
     entropy_floor: float = 0.3
     """Nats; bounds the weight 1 / h^2 of a certain point."""
     residual: float = 0.018
     """Metres; gradient-based optimisation that ends above it has not converged."""
     inliers: float = 0.7
     """Share of pixels within 5 cm; gradient-based optimisation that ends below it has not converged."""
-    uncertainty: bool = True
-    """Off: the fitness is not weighted (the paper's ablation "No U")."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +171,24 @@ class RefineConfig:
     """`adam` on d2t + rgb as in the paper; `lm`: robust second-order steps on d2t."""
     pixels: int = 768
     steps: int = 15
+    smooth_steps: int = 7
+    """Steps on the smooth field before those on the fine one, where there are two."""
     learning_rate: float = 1e-2
     """Of Adam."""
     rgb: float = 1.0
     """Weight of the colour term of Adam (omega in Eq. 15)."""
     robust: float = 0.02
     """Metres, scale of the Cauchy weight."""
+
+
+@dataclass(frozen=True)
+class GuardConfig:
+    """When a tracked pose is not trusted."""
+
+    weak: float = 0.6
+    """Share of known pixels below which a frame is weak: mapped, but the next search is wider."""
+    lost: float = 0.4
+    """Share of known pixels below which a frame is lost: never mapped."""
 
 
 @dataclass(frozen=True)
@@ -170,4 +209,33 @@ class Config:
     loss: LossConfig = LossConfig()
     map: MapConfig = MapConfig()
     track: TrackConfig = TrackConfig()
+    keyframe: KeyframeConfig = KeyframeConfig()
+    guard: GuardConfig = GuardConfig()
     seed: int = 0
+
+
+def preset(name: str) -> Config:
+    """One of PRESETS."""
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset '{name}'; there are {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+PAPER = Config(
+    field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
+    sample=SampleConfig(uniform=20, truncation=20, surface=10),
+    loss=LossConfig(cross_entropy=0.0, color_samples=50),
+    map=MapConfig(steps=15, steps_slow=15, first_steps=500, pixels=384, learning_rate=1e-2),
+    track=TrackConfig(
+        ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
+        go=RefineConfig(method="adam", pixels=384, steps=10),
+    ),
+    keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
+)
+TINY = Config(
+    field=FieldConfig(hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)),
+    sample=SampleConfig(uniform=4, truncation=6),
+    map=MapConfig(steps=4, steps_slow=4, first_steps=60, pixels=64),
+    track=TrackConfig(ro=SearchConfig(particles=128, pixels=48, steps=4), go=RefineConfig(pixels=192, steps=8, smooth_steps=4)),
+)
+PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

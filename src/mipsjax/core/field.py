@@ -18,7 +18,6 @@ Part = Literal["search", "whole"]
 
 # Multipliers of the spatial hash (Teschner et al. 2003): large primes, the first 1 for locality in memory.
 HASH_PRIMES = np.array([1, 2654435761, 805459861], np.uint32)
-CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], np.int32)
 TABLE_INIT = 1e-4
 
 
@@ -120,18 +119,32 @@ def frequencies(points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "
 def hash_features(
     table: Float[Array, "L T F"], points: Float[Array, "N 3"], cfg: FieldConfig
 ) -> Float[Array, "N E"]:
-    """Trilinearly interpolated features of every level (Mueller et al. 2022); no scene bounds are needed."""
-    return jnp.concatenate([_interpolate(table[i], points / size) for i, size in enumerate(_cells(cfg))], -1)
+    """Trilinearly interpolated features of every level (Mueller et al. 2022); no scene bounds are needed.
 
-
-def _interpolate(table: Float[Array, "T F"], cells: Float[Array, "N 3"]) -> Float[Array, "N F"]:
+    Written as one flat array per corner and feature: XLA then fuses the eight gathers of a level with the
+    interpolation, which is an order of magnitude faster on a CPU than gathering rows and summing.
+    """
+    levels, entries, features = table.shape
+    cells = points.T[:, None] / np.array(_cells(cfg), np.float32)[:, None]
     base = jnp.floor(cells)
     offset = cells - base
-    corners = base.astype(jnp.int32)[:, None] + CORNERS
-    mixed = corners.astype(jnp.uint32) * HASH_PRIMES
-    index = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) & np.uint32(table.shape[0] - 1)
-    weight = jnp.prod(jnp.where(CORNERS == 1, offset[:, None], 1 - offset[:, None]), -1)
-    return jnp.sum(table[index.astype(jnp.int32)] * weight[..., None], 1)
+    lo = base.astype(jnp.int32).astype(jnp.uint32) * HASH_PRIMES[:, None, None]
+    hi = lo + HASH_PRIMES[:, None, None]
+    mask, start = np.uint32(entries - 1), np.arange(levels, dtype=np.int32)[:, None] * entries
+    index = jnp.stack(
+        [((x ^ y ^ z) & mask).astype(jnp.int32) + start for x in (lo[0], hi[0]) for y in (lo[1], hi[1]) for z in (lo[2], hi[2])]
+    )
+    flat = table.reshape(levels * entries, features)
+    encoded = [_trilinear(flat[:, f][index], offset) for f in range(features)]
+    return jnp.concatenate(encoded).T
+
+
+def _trilinear(corners: Float[Array, "8 L N"], offset: Float[Array, "3 L N"]) -> Float[Array, "L N"]:
+    """Corners in the order 000, 001, 010, ... of (x, y, z)."""
+    for axis in range(3):
+        half = corners.shape[0] // 2
+        corners = corners[:half] + (corners[half:] - corners[:half]) * offset[axis]
+    return corners[0]
 
 
 def _cells(cfg: FieldConfig) -> list[float]:

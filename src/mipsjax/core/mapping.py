@@ -142,7 +142,10 @@ def map_loss(
         total += tsdf_loss(prediction, samples, cfg)
         psi = prediction.psi
     if field.fine is not None:
-        prediction = nf.fine_tsdf(field, points, cfg.field)
+        # Where there is a smooth field, it alone moves the poses: derivatives through the hash grid cost more
+        # than the rest of the step.
+        fine_points = points if field.smooth is None else jax.lax.stop_gradient(points)
+        prediction = nf.fine_tsdf(field, fine_points, cfg.field)
         total += tsdf_loss(prediction, samples, cfg)
         psi = prediction.psi
     return total + cfg.loss.rgb * color_loss(field, psi, samples, flat, at, cfg)
@@ -164,7 +167,7 @@ def color_loss(field, psi, samples, pixels, at, cfg) -> Float[Array, ""]:
     near = samples.near[:, -n:]
     psi = jax.lax.stop_gradient(psi.reshape(samples.depth.shape)[:, -n:])
     weights = losses.render_weights(psi, near, cfg.field.truncation)
-    rgb = nf.color(field, at(samples.depth[:, -n:]), cfg.field).reshape(*near.shape, 3)
+    rgb = nf.color(field, jax.lax.stop_gradient(at(samples.depth[:, -n:])), cfg.field).reshape(*near.shape, 3)
     return losses.rgb(losses.render(weights, rgb), pixels.color, pixels.depth > 0)
 
 

@@ -1,4 +1,8 @@
-"""Tracking of one frame: randomized, then gradient-based optimisation, as one compiled schedule."""
+"""Tracking of one frame: randomized (RO), then gradient-based (GO) optimisation, as one compiled schedule.
+
+Poses are camera-to-submap matrices. Twists are (v, omega), metres and radians, in the camera's own frame:
+T(xi) = T exp(xi).
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,27 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+import optax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
 
-from mipsjax.config import Config, FieldConfig, RefineConfig
+from mipsjax.config import Config
 from mipsjax.core import field as nf
-from mipsjax.core import particles as ro
+from mipsjax.core import losses, particles, sampling
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, transform
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
+DAMPING = 1e-3  # first Levenberg-Marquardt factor
+DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
+PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
 class Points(NamedTuple):
+    """P measured points of one frame."""
+
     p_cam: Float[Array, "P 3"]
+    color: Float[Array, "P 3"]
     mask: Bool[Array, " P"]
+    """False where there is no measurement."""
 
 
 class Fit(NamedTuple):
@@ -28,111 +40,185 @@ class Fit(NamedTuple):
 
     residual: Float[Array, ""]
     """Root of the mean robust cost, metres."""
-    inliers: Float[Array, ""]
-    """Share of measured pixels within 5 cm of the surface."""
+    known: Float[Array, ""]
+    """Share of measured pixels within `keyframe.error` of the mapped surface."""
 
 
 class TrackInfo(NamedTuple):
+    """What happened to one frame."""
+
     before: Fit
+    """At the better of the candidates."""
     after: Fit
     searched: Bool[Array, ""]
+    """RO was run."""
     ok: Bool[Array, ""]
+    """Everything is finite; if not, the pose is the candidate."""
 
 
-def draw_points(key, depth: Float[Array, "H W"], pixels: int, camera: Intrinsics) -> Points:
-    """Points of a randomly shifted stripe grid, camera frame."""
+def draw_points(
+    key: PRNGKeyArray, depth: Float[Array, "H W"], color: UInt8[Array, "H W 3"], pixels: int, camera: Intrinsics
+) -> Points:
+    """Points of a stripe grid of about `pixels` cells, shifted by a random part of a cell."""
     height, width = depth.shape
     v, u = pixel_grid(*grid_shape(pixels, height, width), jax.random.uniform(key, (2,)), height, width)
     d = depth[v, u]
-    return Points(rays(v, u, camera) * d[:, None], d > 0)
+    return Points(rays(v, u, camera) * d[:, None], color[v, u].astype(jnp.float32) / 255, d > 0)
 
 
-def robust_cost(psi, cfg: RefineConfig):
-    """Cauchy, square metres."""
-    return cfg.robust**2 * jnp.log1p((psi / cfg.robust) ** 2)
+def robust_cost(psi: Float[Array, " P"], scale: float) -> Float[Array, " P"]:
+    """Cauchy cost, square metres; its weight is 1 / (1 + (psi / scale)^2)."""
+    return scale**2 * jnp.log1p((psi / scale) ** 2)
 
 
-def fit(field, T, points: Points, part, cfg: Config) -> Fit:
+def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> Fit:
+    """Residual and share of known pixels at a pose."""
     psi = nf.tsdf(field, transform(T, points.p_cam), cfg.field, part).psi
-    n = jnp.maximum(jnp.sum(points.mask), 1)
-    res = jnp.sqrt(jnp.sum(robust_cost(psi, cfg.track.go) * points.mask) / n)
-    return Fit(res, jnp.sum((jnp.abs(psi) < 0.05) & points.mask) / n)
+    cost = losses.masked_mean(robust_cost(psi, cfg.track.go.robust), points.mask)
+    known = losses.masked_mean((jnp.abs(psi) < cfg.keyframe.error).astype(psi.dtype), points.mask)
+    return Fit(jnp.sqrt(cost), known)
 
 
-def refine_lm(field, T0, points: Points, part, cfg: Config, steps: int):
-    """Levenberg-Marquardt on d2t with a Cauchy weight; the closed 6 x 6 system."""
-    go, tau = cfg.track.go, cfg.field.truncation
+def levenberg_marquardt(
+    field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, steps: int, cfg: Config
+) -> Float[Array, "4 4"]:
+    """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
+
+    Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
+    the map is never an improvement.
+    """
+    scale = cfg.track.go.robust
 
     def system(T):
-        p = transform(T, points.p_cam)
-        psi, pull = jax.vjp(lambda x: nf.tsdf(field, x, cfg.field, part).psi, p)
-        (gradient,) = pull(jnp.ones_like(psi))
-        g_cam = gradient @ T[:3, :3]
-        J = jnp.concatenate([g_cam, jnp.cross(points.p_cam, g_cam)], -1)
-        w = points.mask * (jnp.abs(psi) < SATURATED * tau) / (1 + (psi / go.robust) ** 2)
-        cost = jnp.sum(robust_cost(psi, go) * points.mask)
-        return cost, (J.T * w) @ J, (J.T * w) @ psi
+        psi, pull = jax.vjp(lambda p: nf.tsdf(field, p, cfg.field, part).psi, transform(T, points.p_cam))
+        gradient = pull(jnp.ones_like(psi))[0] @ T[:3, :3]
+        jacobian = jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
+        weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
+        weighted = jacobian.T * weight
+        return jnp.sum(robust_cost(psi, scale) * points.mask), weighted @ jacobian, weighted @ psi
 
     def step(carry, _):
-        T, cost, H, b, damping = carry
-        A = H + damping * jnp.diag(jnp.diag(H)) + 1e-3 * jnp.eye(6)
-        xi = -jnp.linalg.solve(A, b)
-        T_new = T @ jaxlie.SE3.exp(xi).as_matrix()
-        cost_new, H_new, b_new = system(T_new)
-        better = cost_new < cost
-        pick = partial(jax.tree.map, lambda a, b: jnp.where(better, a, b))
-        T, cost, H, b = pick((T_new, cost_new, H_new, b_new), (T, cost, H, b))
-        return (T, cost, H, b, jnp.where(better, damping * 0.3, damping * 4.0)), cost
+        here, damping = carry
+        T, (cost, hessian, slope) = here
+        damped = hessian + damping * jnp.diag(jnp.diag(hessian)) + PRIOR * jnp.eye(6)
+        twist = -jnp.linalg.solve(damped, slope)
+        T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
+        there = T_new, system(T_new)
+        better = there[1][0] < cost
+        here = jax.tree.map(partial(jnp.where, better), there, here)
+        return (here, damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)), None
 
-    start = (T0, *system(T0), jnp.float32(1e-3))
-    (T, *_), costs = jax.lax.scan(step, start, None, length=steps)
-    return T, costs
+    start = ((T, system(T)), jnp.float32(DAMPING))
+    ((T, _), _), _ = jax.lax.scan(step, start, None, length=steps)
+    return T
+
+
+def adam(
+    field: nf.Field, T: Float[Array, "4 4"], points: Points, key: PRNGKeyArray, cfg: Config
+) -> Float[Array, "4 4"]:
+    """First-order refinement of d2t + omega rgb (Eq. 15), as in the paper."""
+    optimizer = optax.adam(cfg.track.go.learning_rate)
+
+    def loss(twist):
+        T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
+        psi = nf.tsdf(field, transform(T_new, points.p_cam), cfg.field).psi
+        total = losses.d2t(psi, points.mask)
+        return total + cfg.track.go.rgb * _rgb_loss(field, T_new, points, key, cfg) if cfg.track.go.rgb else total
+
+    def step(carry, _):
+        twist, state = carry
+        change, state = optimizer.update(jax.grad(loss)(twist), state)
+        return (twist + change, state), None
+
+    zero = jnp.zeros(6)
+    (twist, _), _ = jax.lax.scan(step, (zero, optimizer.init(zero)), None, length=cfg.track.go.steps)
+    return T @ jaxlie.SE3.exp(twist).as_matrix()
+
+
+def _rgb_loss(field, T, points: Points, key, cfg: Config) -> Float[Array, ""]:
+    tau = cfg.field.truncation
+    measured = points.p_cam[:, 2]
+    depth = sampling.stratified(key, jnp.maximum(measured - tau, sampling.NEAR), measured + tau, cfg.sample.truncation)
+    ray = points.p_cam / jnp.maximum(measured, sampling.NEAR)[:, None]
+    p_sub = transform(T, (ray[:, None] * depth[..., None]).reshape(-1, 3))
+    psi = nf.tsdf(field, p_sub, cfg.field).psi.reshape(depth.shape)
+    weights = losses.render_weights(psi, jnp.ones_like(psi, bool), tau)
+    rgb = nf.color(field, p_sub, cfg.field).reshape(*depth.shape, 3)
+    return losses.rgb(losses.render(weights, rgb), points.color, points.mask)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
 def track(
     field: nf.Field,
     depth: Float[Array, "H W"],
+    color: UInt8[Array, "H W 3"],
     candidates: Float[Array, "K 4 4"],
-    radii: Float[Array, "6"],
-    force: Bool[Array, ""],
+    widening: Float[Array, ""],
     key: PRNGKeyArray,
     camera: Intrinsics,
     cfg: Config,
-):
-    k_go, k_ro, k_fit = jax.random.split(key, 3)
-    points = draw_points(k_go, depth, cfg.track.go.pixels, camera)
-    coarse = jax.vmap(lambda T: fit(field, T, points, "search", cfg).residual)(candidates)
-    T0 = candidates[jnp.argmin(coarse)]
-    before = fit(field, T0, points, "whole", cfg)
+) -> tuple[Float[Array, "4 4"], TrackInfo]:
+    """Pose of one frame in the submap, from a few candidates of the motion prior.
 
-    def go(T):
-        if cfg.field.encoding == "both":
-            T, _ = refine_lm(field, T, points, "search", cfg, cfg.track.go.steps // 2)
-        T, _ = refine_lm(field, T, points, "whole", cfg, cfg.track.go.steps)
-        return T, fit(field, T, points, "whole", cfg)
+    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best
+    candidate, and RO then GO follow where that did not converge; the better end is kept. `widening` is a factor
+    on the swarm's first radii.
+    """
+    k_go, k_ro, k_adam = jax.random.split(key, 3)
+    ro = cfg.track.ro
+    points = draw_points(k_go, depth, color, cfg.track.go.pixels, camera)
+    search_cost = jax.vmap(lambda T: measure_fit(field, T, points, "search", cfg).residual)(candidates)
+    start = candidates[jnp.argmin(search_cost)]
+    before = measure_fit(field, start, points, "whole", cfg)
 
-    def search(T):
-        particles = jnp.asarray(ro.template(cfg.track.ro.particles))
+    def refined(T):
+        if cfg.track.go.method == "adam":
+            T = adam(field, T, points, k_adam, cfg)
+        elif cfg.track.go.method == "lm":
+            if cfg.field.encoding == "both":
+                T = levenberg_marquardt(field, T, points, "search", cfg.track.go.smooth_steps, cfg)
+            T = levenberg_marquardt(field, T, points, "whole", cfg.track.go.steps, cfg)
+        return T, measure_fit(field, T, points, "whole", cfg)
 
-        def one(swarm, k):
-            sample = draw_points(k, depth, cfg.track.ro.pixels, camera)
-            return ro.step(swarm, particles, field, sample.p_cam, sample.mask, cfg.field, cfg.track.ro), swarm.cost
+    def searched(T):
+        return refined(search(field, depth, color, T, widening, k_ro, camera, cfg))
 
-        swarm = ro.Swarm(T, jnp.float32(jnp.inf), radii)
-        swarm, _ = jax.lax.scan(one, swarm, jax.random.split(k_ro, cfg.track.ro.steps))
-        return swarm.T_sub_cam
+    if ro.when == "always":
+        (T, after), used_ro = searched(start), jnp.bool_(True)
+    else:
+        T, after = refined(start)
+        used_ro = (after.residual > ro.residual) | (after.known < ro.inliers) | ~jnp.isfinite(after.residual)
+        used_ro = used_ro & (ro.when == "needed")
 
-    T, after = go(T0)
-    searched = jnp.bool_(False)
-    if cfg.track.ro.when != "never":
-        searched = force | (after.residual > cfg.track.ro.residual) | (after.inliers < cfg.track.ro.inliers)
+        def again():
+            there = searched(start)
+            better = there[1].residual < after.residual
+            return jax.tree.map(partial(jnp.where, better), there, (T, after))
 
-        def retry():
-            T2, after2 = go(search(T0))
-            better = after2.residual < after.residual
-            return jax.tree.map(lambda a, b: jnp.where(better, a, b), (T2, after2), (T, after))
-
-        T, after = jax.lax.cond(searched, retry, lambda: (T, after))
+        if ro.when == "needed":
+            T, after = jax.lax.cond(used_ro, again, lambda: (T, after))
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
-    return jnp.where(ok, T, T0), TrackInfo(before, after, searched, ok)
+    return jnp.where(ok, T, start), TrackInfo(before, after, used_ro, ok)
+
+
+def search(
+    field: nf.Field,
+    depth: Float[Array, "H W"],
+    color: UInt8[Array, "H W 3"],
+    T: Float[Array, "4 4"],
+    widening: Float[Array, ""],
+    key: PRNGKeyArray,
+    camera: Intrinsics,
+    cfg: Config,
+) -> Float[Array, "4 4"]:
+    """RO: the swarm's iterations by `lax.scan`, on another shift of the pixel grid each."""
+    ro = cfg.track.ro
+    swarm_template = jnp.asarray(particles.template(ro.particles))
+
+    def step(swarm, k):
+        points = draw_points(k, depth, color, ro.pixels, camera)
+        return particles.step(swarm, swarm_template, field, points.p_cam, points.mask, cfg.field, ro), None
+
+    radii = widening * jnp.array([ro.rotation] * 3 + [ro.translation] * 3)
+    swarm = particles.Swarm(T, jnp.float32(jnp.inf), radii)
+    return jax.lax.scan(step, swarm, jax.random.split(key, ro.steps))[0].T_sub_cam

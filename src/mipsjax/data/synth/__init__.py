@@ -18,19 +18,26 @@ def synth_names() -> dict[str, str]:
 def open_synth(name: str, frames: slice, input: InputConfig) -> SynthSequence:
     """The synthetic sequence `name` (without `synth:`), such as `room-fast+noise+blur`.
 
-    `frames` selects START:STOP:STEP of its frames. Images wider than the working width are decimated by a whole
-    factor, and depth outside the range of `input` is 0. Raises InputError for unknown names and empty selections.
+    `frames` selects START:STOP:STEP of its frames. Images wider than the working width are decimated by a
+    whole factor, and depth outside the range of `input` is 0. Raises InputError for unknown names and
+    for empty selections.
     """
     base, *suffixes = name.split("+")
-    if base not in SPECS or not set(suffixes) <= set(Degradations._fields) or len(set(suffixes)) < len(suffixes):
+    if (
+        base not in SPECS
+        or not set(suffixes) <= set(Degradations._fields)
+        or len(set(suffixes)) < len(suffixes)
+    ):
         raise InputError(
-            f"synth:{name}: no such sequence; choose one of {', '.join(SPECS)}, with +noise or +blur or both behind it"
+            f"synth:{name}: no such sequence; choose one of {', '.join(SPECS)}, "
+            "with +noise or +blur or both behind it"
         )
     spec = SPECS[base]
     indices = range(spec.frames)[frames]
     if len(indices) == 0 or indices.step < 0:
         raise InputError(
-            f"synth:{name}: no frames in {_text(frames)}; it has {spec.frames}, numbered from 0, in the order of time"
+            f"synth:{name}: no frames in {_text(frames)}; it has {spec.frames}, numbered from 0, "
+            "in the order of time"
         )
     degradations = Degradations(**dict.fromkeys(suffixes, True))
     every_px = max(1, round(spec.intrinsics.width / input.working_width))

@@ -20,7 +20,7 @@ _BLOCK_CELLS = 20
 _CHUNK = 65536
 # Vertices nearer than this share of a voxel are one: neighbouring blocks agree to rounding only
 _WELD = 1e-2
-# Corrections of vertices towards the surface by Newton's method; one leaves micrometres on flat and round faces
+# Corrections of vertices by Newton's method; the first leaves micrometres on flat and round faces
 _CORRECTIONS = 2
 # Greatest correction in voxels: at creases the linear model points anywhere
 _CORRECTION_VOXELS = 0.5
@@ -29,8 +29,8 @@ _CORRECTION_VOXELS = 0.5
 def reference_mesh(scene: Scene, voxel_m: float = 0.01) -> trimesh.Trimesh:
     """The zero set of the scene's distance in the world frame, metres, normals into free space.
 
-    Marching cubes on blocks of cells of `voxel_m`, vertices then moved onto the surface; edges are cut by up to half
-    a voxel. Vertex colours are those of the rendered images.
+    Marching cubes on blocks of cells of `voxel_m`, vertices then moved onto the surface; edges are cut by up
+    to half a voxel. Vertex colours are those of the rendered images.
     """
     # A cell and a half outside, so that no wall along the axes lies in a plane of the grid
     low = np.asarray(scene.bounds, np.float64)[0] - 1.5 * voxel_m
@@ -47,10 +47,12 @@ def reference_mesh(scene: Scene, voxel_m: float = 0.01) -> trimesh.Trimesh:
 
 
 def _surface_blocks(scene: Scene, low: Float64[np.ndarray, "3"], voxel_m: float) -> Int[np.ndarray, "B 3"]:
-    """First cells of the blocks that may hold surface: the distance in their middle is within half the diagonal."""
+    """First cells of blocks that may hold surface: the distance in the middle is within half a diagonal."""
     high = np.asarray(scene.bounds, np.float64)[1] + voxel_m
     counts = np.ceil((high - low) / (_BLOCK_CELLS * voxel_m)).astype(int)
-    first = _BLOCK_CELLS * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    first = _BLOCK_CELLS * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
     middle = low + voxel_m * (first + _BLOCK_CELLS / 2)
     free = _in_chunks(lambda points: _distance(scene, points), middle)
     return first[np.abs(free) <= np.sqrt(3.0) / 2 * _BLOCK_CELLS * voxel_m]
@@ -86,7 +88,9 @@ def _distance(scene: Scene, points: Float[Array, "N 3"]) -> Float[Array, "N"]:
 
 
 @jax.jit
-def _onto_surface(scene: Scene, points: Float[Array, "N 3"], bound_m: Float[Array, ""]) -> Float[Array, "N 3"]:
+def _onto_surface(
+    scene: Scene, points: Float[Array, "N 3"], bound_m: Float[Array, ""]
+) -> Float[Array, "N 3"]:
     for _ in range(_CORRECTIONS):
         surface = scene.surface(points)
         points = points - jnp.clip(surface.distance, -bound_m, bound_m)[:, None] * surface.normal

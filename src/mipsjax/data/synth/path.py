@@ -44,7 +44,7 @@ class CameraPath:
     """Whether the path returns to its start with the same motion and goes round again."""
 
     def poses(self, times: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
-        """Camera-to-world at times in seconds: wrapped round on a closed path, held at the ends of an open one."""
+        """Camera-to-world at times in seconds; a closed path goes on round, an open one rests at its ends."""
         within = np.mod(times, self.duration) if self.closed else np.clip(times, 0.0, self.duration)
         return _poses(self.position, self.target, self.roll, self.knot_at(within))
 
@@ -60,9 +60,9 @@ def spline_path(
 ) -> CameraPath:
     """A path through `places` (world, metres), looking at `targets` there.
 
-    `pace` gives the wished speed in metres a second at a fraction of the length in 0..1. The path goes as near
-    to it as the limits allow; where linear and angular limits contradict each other the upper ones hold. The
-    camera's horizon sways by up to `roll_deg`, as in a hand.
+    `pace` gives the wished speed in metres a second at a fraction of the length in 0..1. The path goes as
+    near to it as the limits allow; where linear and angular limits contradict each other the upper ones hold.
+    The camera's horizon sways by up to `roll_deg`, as in a hand.
     """
     if closed:
         places, targets = np.vstack([places, places[:1]]), np.vstack([targets, targets[:1]])
@@ -71,10 +71,10 @@ def spline_path(
     ends = "periodic" if closed else "natural"
     sway = np.radians(roll_deg) * np.sin(2.4 * np.arange(len(knots)))
     sway[-1] = sway[0] if closed else sway[-1]
-    splines = [CubicSpline(knots, values, bc_type=ends) for values in (places, targets, sway)]
+    position, target, roll = (CubicSpline(knots, values, bc_type=ends) for values in (places, targets, sway))
     samples = np.linspace(0.0, knots[-1], _SAMPLES)
-    times = _timing(_poses(*splines, samples), limits, pace, closed)
-    return CameraPath(*splines, PchipInterpolator(times, samples), float(times[-1]), closed)
+    times = _timing(_poses(position, target, roll, samples), limits, pace, closed)
+    return CameraPath(position, target, roll, PchipInterpolator(times, samples), float(times[-1]), closed)
 
 
 def speeds(
@@ -106,7 +106,7 @@ def _unit(vectors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
 
 
 def _angles(T_world_cam: Float64[np.ndarray, "N 4 4"]) -> Float64[np.ndarray, "N-1"]:
-    """Angle of rotation between neighbours, by the chord |R1 - R2| = sqrt(8) sin(angle / 2): exact when small."""
+    """Angle of rotation between neighbours, by the chord |R1 - R2| = sqrt(8) sin(angle / 2)."""
     chord = np.linalg.norm(np.diff(T_world_cam[:, :3, :3], axis=0), axis=(1, 2))
     return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
 
@@ -118,7 +118,7 @@ def _timing(
     closed: bool,
 ) -> Float64[np.ndarray, "S"]:
     """Seconds at each pose, from 0."""
-    steps, turns = (values for values in speeds(T_world_cam, 1.0))
+    steps, turns = speeds(T_world_cam, 1.0)
     along = np.cumsum(steps) - 0.5 * steps
     low, high = _allowed(turns / steps, limits)
     width = _SMOOTHING_M / np.mean(steps)

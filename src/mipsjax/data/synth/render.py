@@ -16,20 +16,18 @@ from mipsjax.data.synth.texture import albedo
 
 # A ray this near to a surface (metres) has hit it; the last correction along the ray then leaves micrometres
 _HIT = 2e-4
-# Most rays hit at their first contact. The others go on in batches of these shares of all rays, by these numbers
-# of steps at a time: few rays, which graze a rounded edge, take long
+# Most rays hit at their first contact. The others go on in batches of these shares of all rays, by these
+# numbers of steps at a time: few rays, which graze a rounded edge, take long
 _BATCH_SHARES, _STEPS = (16, 256), (4, 12)
 # Bound of the loop, far above the 20 or so rounds that an image takes
 _MOST_ROUNDS = 2000
 # Two carved boxes meet along a ray if the second begins at most this far (metres) behind the end of the first
 _JOINT = 1e-4
-# Shapes unrolled into one compiled loop body: rays stay in registers between them
-_UNROLL = 4
 # Against division by zero along an axis the ray does not move on
 _TINY = 1e-9
 # Least cosine between ray and normal for the last correction along the ray, and its bound in metres
 _GRAZING, _CORRECTION = 0.02, 5e-3
-# Distances from the surface (metres) at which its surroundings are felt for ambient shading, and their weights
+# Distances from a surface (metres) at which what is around it shades it, and how much
 _AMBIENT_REACH = ((0.06, 0.45), (0.28, 0.4))
 # Ambient light from below and from above, linear
 _AMBIENT_DOWN, _AMBIENT_UP = 0.22, 0.38
@@ -63,11 +61,14 @@ class Image(NamedTuple):
 
 
 def render(scene: Scene, intrinsics: Intrinsics, T_world_cam: Float64[np.ndarray, "K 4 4"]) -> Image:
-    """One image exposed along K poses: the mean of their light, and the exact depth at the middle pose."""
+    """One image exposed along K camera-to-world poses: the mean of their light, the depth of the middle one.
+
+    Every pixel has a depth, exact to float32. The cameras must stand in free space.
+    """
     fx, fy, cx, cy, width, height = intrinsics
     pinhole = jnp.array([fx, fy, cx, cy], jnp.float32)
     views = [_view(scene, jnp.asarray(pose, jnp.float32), pinhole, height, width) for pose in T_world_cam]
-    light = sum(np.asarray(color) for color, _ in views) / len(views)
+    light = np.mean([np.asarray(color) for color, _ in views], axis=0)
     return Image(display(light), np.asarray(views[len(views) // 2][1]))
 
 
@@ -76,9 +77,7 @@ def display(light: Float[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
     return np.round(255.0 * np.clip(light, 0.0, 1.0) ** _GAMMA).astype(np.uint8)
 
 
-def pixel_rays(
-    T_world_cam: Float[Array, "4 4"], pinhole: Float[Array, "4"], height: int, width: int
-) -> Rays:
+def pixel_rays(T_world_cam: Float[Array, "4 4"], pinhole: Float[Array, "4"], height: int, width: int) -> Rays:
     """Rays through the pixel centres, row by row. `pinhole` is (fx, fy, cx, cy) in pixels."""
     fx, fy, cx, cy = pinhole
     v, u = jnp.mgrid[:height, :width].reshape(2, -1)
@@ -143,7 +142,7 @@ def _first_contact(scene: Scene, rays: Rays, after: Float[Array, "N"]) -> Float[
             hit = (entry < leave) & (leave > after)
             return jnp.where(hit, jnp.minimum(best, entry), best), None
 
-        free, _ = jax.lax.scan(nearer, free, shapes, unroll=_UNROLL)
+        free, _ = jax.lax.scan(nearer, free, shapes)
     return jnp.maximum(free, after)
 
 
@@ -153,7 +152,9 @@ def _end_of_room(carved: Shapes, rays: Rays) -> Float[Array, "N"]:
     leave = jnp.where(entry < leave, leave, 0.0)
 
     def pass_on(_: Array, reached: Array) -> Array:
-        return jnp.maximum(reached, jnp.max(jnp.where(entry <= reached + _JOINT, leave, 0.0), axis=0))
+        return jnp.maximum(
+            reached, jnp.max(jnp.where(entry <= reached[None, :] + _JOINT, leave, 0.0), axis=0)
+        )
 
     return jax.lax.fori_loop(0, entry.shape[0], pass_on, jnp.zeros(entry.shape[1]))
 
@@ -175,9 +176,7 @@ class _Tracing(NamedTuple):
     rounds: Int[Array, ""]
 
 
-def _trace_down_to(
-    left: int, scene: Scene, rays: Rays, state: _Tracing, size: int, steps: int
-) -> _Tracing:
+def _trace_down_to(left: int, scene: Scene, rays: Rays, state: _Tracing, size: int, steps: int) -> _Tracing:
     """Advance rays in batches of `size` until at most `left` of them have not hit."""
 
     def under_way(state: _Tracing) -> Bool[Array, ""]:
@@ -196,7 +195,7 @@ def _trace_down_to(
 def _approach(
     scene: Scene, rays: Rays, depth: Float[Array, "N"], steps: int
 ) -> tuple[Float[Array, "N"], Bool[Array, "N"]]:
-    """Move rays ahead to the next contact in closed form, then by sphere tracing; and which have not hit yet."""
+    """Rays moved to their next contact in closed form, then by sphere tracing; which have not hit yet."""
     length = jnp.sqrt(sum(d**2 for d in rays.direction))
     start = _first_contact(scene, rays, depth)
 
@@ -210,7 +209,7 @@ def _approach(
 
 
 def irradiance(scene: Scene, surface: Surface, points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """Linear RGB light on surface points: Lambert from every light, ambient less in corners. View-independent."""
+    """Linear RGB light that points receive: from every light by the cosine, ambient less in corners."""
 
     def feel(openness: Array, tap: Float[Array, "2"]) -> tuple[Array, None]:
         reach, weight = tap

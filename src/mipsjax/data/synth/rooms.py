@@ -2,37 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.data.synth.scene import Lights, Scene, Shapes
-from mipsjax.data.synth.texture import Materials
-
-RGB = tuple[float, float, float]
-
-
-class Paint(NamedTuple):
-    """One material; see `Materials`."""
-
-    dark: RGB
-    bright: RGB
-    frequency: RGB
-    weights: tuple[float, float, float, float, float]
-
-
-class Solid(NamedTuple):
-    """One shape; see `Shapes`."""
-
-    center: RGB
-    half: RGB
-    rounding: float
-    turn_deg: float
-    material: tuple[str, str, str]
-
+from mipsjax.data.synth.build import Paint, Place, Solid, assemble, ball, block, hollow, post
+from mipsjax.data.synth.scene import Scene
 
 _NOISE, _CHECKS, _STRIPES = (1.0, 0.0, 0.0, 0.0, 0.0), (0.3, 0.7, 0.0, 0.0, 0.0), (0.35, 0.0, 0.65, 0.0, 0.0)
 _WOOD, _PICTURE = (0.45, 0.0, 0.0, 0.55, 0.0), (0.9, 0.0, 0.0, 0.0, 0.65)
@@ -64,79 +39,11 @@ PAINTS: dict[str, Paint] = {
 }
 
 
-def block(
-    place: tuple[float, float],
-    bottom: float,
-    size: RGB,
-    material: str,
-    *,
-    rounding: float = 0.0,
-    turn_deg: float = 0.0,
-    top: str | None = None,
-) -> Solid:
-    """A box on a place, `size` = (along x, height, along z) before the turn."""
-    center = (place[0], -(bottom + size[1] / 2), place[1])
-    half = (size[0] / 2, size[1] / 2, size[2] / 2)
-    return Solid(center, half, rounding, turn_deg, (top or material, material, material))
-
-
-def post(
-    place: tuple[float, float], bottom: float, radius: float, height: float, material: str, rounding: float = 0.0
-) -> Solid:
-    """An upright cylinder."""
-    center = (place[0], -(bottom + height / 2), place[1])
-    return Solid(center, (radius, height / 2, radius), rounding, 0.0, (material,) * 3)
-
-
-def ball(place: tuple[float, float], bottom: float, radius: float, material: str) -> Solid:
-    """A sphere."""
-    return block(place, bottom, (2 * radius, 2 * radius, 2 * radius), material, rounding=radius)
-
-
-def hollow(
-    low: tuple[float, float], high: tuple[float, float], bottom: float, height: float, faces: tuple[str, str, str]
-) -> Solid:
-    """Free space between two places, with the materials of its floor, walls and ceiling."""
-    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
-    size = (high[0] - low[0], height, high[1] - low[1])
-    return block(middle, bottom, size, faces[1])._replace(material=faces)
-
-
-def assemble(
-    carved: Sequence[Solid], boxes: Sequence[Solid], cylinders: Sequence[Solid], lights: Sequence[tuple[RGB, RGB]]
-) -> Scene:
-    """The scene of these solids; `lights` are pairs of position (x, height, z) and linear RGB."""
-    low = np.min([np.subtract(solid.center, solid.half) for solid in carved], axis=0)
-    high = np.max([np.add(solid.center, solid.half) for solid in carved], axis=0)
-    position = jnp.array([(x, -height, z) for (x, height, z), _ in lights], jnp.float32).reshape(-1, 3)
-    color = jnp.array([rgb for _, rgb in lights], jnp.float32).reshape(-1, 3)
-    return Scene(
-        carved=_shapes(carved),
-        boxes=_shapes(boxes),
-        cylinders=_shapes(cylinders),
-        materials=Materials(*(jnp.array(column, jnp.float32) for column in zip(*PAINTS.values(), strict=True))),
-        lights=Lights(position, color),
-        bounds=jnp.array([low, high], jnp.float32),
-    )
-
-
-def _shapes(solids: Iterable[Solid]) -> Shapes:
-    rows, number = list(solids), {name: row for row, name in enumerate(PAINTS)}
-    turn = np.radians([solid.turn_deg for solid in rows])
-    return Shapes(
-        center=jnp.array([solid.center for solid in rows], jnp.float32).reshape(-1, 3),
-        half=jnp.array([solid.half for solid in rows], jnp.float32).reshape(-1, 3),
-        rounding=jnp.array([solid.rounding for solid in rows], jnp.float32),
-        turn=jnp.array(np.stack([np.cos(turn), np.sin(turn)], axis=-1), jnp.float32).reshape(-1, 2),
-        material=jnp.array([[number[m] for m in s.material] for s in rows], jnp.int32).reshape(-1, 3),
-    )
-
-
-def _chair(place: tuple[float, float], turn_deg: float) -> tuple[list[Solid], list[Solid]]:
+def _chair(place: Place, turn_deg: float) -> tuple[list[Solid], list[Solid]]:
     """Seat and back, and four legs; turned by 0 it faces +z."""
     angle = np.radians(turn_deg)
 
-    def at(x: float, z: float) -> tuple[float, float]:
+    def at(x: float, z: float) -> Place:
         turned_x, turned_z = x * np.cos(angle) + z * np.sin(angle), z * np.cos(angle) - x * np.sin(angle)
         return place[0] + float(turned_x), place[1] + float(turned_z)
 
@@ -163,7 +70,9 @@ def _shelf() -> list[Solid]:
     """Against the wall x = -2.5, with what stands on its boards."""
     x, depth = -2.34, 0.32
     sides = [block((x, z), 0.0, (depth, 1.95, 0.03), "oak") for z in (0.20, 1.50)]
-    boards = [block((x, 0.85), bottom, (depth, 0.03, 1.30), "oak") for bottom in (0.08, 0.50, 0.92, 1.34, 1.92)]
+    boards = [
+        block((x, 0.85), bottom, (depth, 0.03, 1.30), "oak") for bottom in (0.08, 0.50, 0.92, 1.34, 1.92)
+    ]
     things = [
         block((x, 0.52), 0.53, (0.22, 0.27, 0.46), "books"),
         block((x, 1.20), 0.11, (0.26, 0.28, 0.40), "clay", rounding=0.02, turn_deg=8.0),
@@ -179,7 +88,10 @@ def _shelf() -> list[Solid]:
 def _table() -> tuple[list[Solid], list[Solid]]:
     top = block((0.35, 0.25), 0.70, (1.25, 0.04, 0.78), "walnut", rounding=0.01)
     legs = [post((x, z), 0.0, 0.035, 0.70, "walnut") for x in (-0.19, 0.89) for z in (-0.06, 0.56)]
-    things = [block((0.62, 0.30), 0.74, (0.24, 0.05, 0.17), "books", turn_deg=25.0), ball((0.10, 0.36), 0.74, 0.07, "green")]
+    things = [
+        block((0.62, 0.30), 0.74, (0.24, 0.05, 0.17), "books", turn_deg=25.0),
+        ball((0.10, 0.36), 0.74, 0.07, "green"),
+    ]
     return [top, *things], [*legs, post((0.36, 0.12), 0.74, 0.045, 0.11, "blue", 0.005)]
 
 
@@ -228,7 +140,16 @@ def living_room() -> Scene:
     table, table_posts = _table()
     rug = block((0.1, -0.1), 0.0, (2.6, 0.012, 1.9), "rug", turn_deg=4.0)
     plant = [ball((-2.12, -1.62), 0.62, 0.24, "leaf"), ball((-1.98, -1.50), 0.50, 0.16, "leaf")]
-    boxes = [rug, *plant, *table, *_sofa(), *_shelf(), *_walls(), *_boards(), *(s for chair in chairs for s in chair[0])]
+    boxes = [
+        rug,
+        *plant,
+        *table,
+        *_sofa(),
+        *_shelf(),
+        *_walls(),
+        *_boards(),
+        *(s for chair in chairs for s in chair[0]),
+    ]
     cylinders = [
         *table_posts,
         *(leg for chair in chairs for leg in chair[1]),
@@ -240,5 +161,9 @@ def living_room() -> Scene:
         post((0.2, 0.0), 2.42, 0.20, 0.18, "shade", 0.03),
         post((-1.75, 1.86), 1.05, 0.09, 0.24, "blue", 0.03),
     ]
-    lights = [((0.2, 2.2, 0.0), (1.5, 1.42, 1.28)), ((0.05, 1.6, 1.7), (0.45, 0.50, 0.60)), ((1.28, 1.2, -1.2), (0.3, 0.24, 0.15))]
-    return assemble(carved, boxes, cylinders, lights)
+    lights = [
+        ((0.2, 2.2, 0.0), (1.5, 1.42, 1.28)),
+        ((0.05, 1.6, 1.7), (0.45, 0.50, 0.60)),
+        ((1.28, 1.2, -1.2), (0.3, 0.24, 0.15)),
+    ]
+    return assemble(PAINTS, carved, boxes, cylinders, lights)

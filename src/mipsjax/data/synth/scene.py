@@ -15,12 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from mipsjax.data.synth.texture import Materials, albedo
 
-# Shapes unrolled into one compiled loop body: points stay in registers between them
-_UNROLL = 4
 # Keeps square roots differentiable at zero; its root, 1e-10 m, is far below float32 resolution here
 _TINY_SQUARE = 1e-20
-# Where normals are taken, sharp edges of solids are rounded and rooms enlarged by this (metres): it moves the kink
-# between inner and outer distance off the surface, where a rounding error would choose the side
+# Where normals are taken, sharp edges of solids are rounded and rooms enlarged by this (metres): it moves the
+# kink between inner and outer distance off the surface, where a rounding error would choose the side
 _SOFT_EDGE = 1e-3
 # Cosine above which a face counts as horizontal when its material is chosen
 _HORIZONTAL = 0.7
@@ -160,15 +158,15 @@ class _Best(NamedTuple):
     """Running choice of a surface over the shapes seen so far."""
 
     distance: Float[Array, "N"]
-    index: Int[Array, "N"]
-    count: Int[Array, ""]
+    shape: Int[Array, "N"]
+    seen: Int[Array, ""]
 
 
 def _choose(best: _Best, candidate: Float[Array, "N"], better: Array) -> _Best:
     return _Best(
         jnp.where(better, candidate, best.distance),
-        jnp.where(better, best.count, best.index),
-        best.count + 1,
+        jnp.where(better, best.seen, best.shape),
+        best.seen + 1,
     )
 
 
@@ -190,14 +188,14 @@ def _nearest(scene: Scene, p: Components) -> tuple[Float[Array, "N"], Int[Array,
         return step
 
     start = _Best(jnp.full(p.x.shape, -jnp.inf), jnp.zeros(p.x.shape, jnp.int32), jnp.int32(0))
-    best, _ = jax.lax.scan(widest, start, scene.carved, unroll=_UNROLL)
-    best, _ = jax.lax.scan(least(_box_distance), best, scene.boxes, unroll=_UNROLL)
-    best, _ = jax.lax.scan(least(_cylinder_distance), best, scene.cylinders, unroll=_UNROLL)
-    return best.distance, best.index
+    best, _ = jax.lax.scan(widest, start, scene.carved)
+    best, _ = jax.lax.scan(least(_box_distance), best, scene.boxes)
+    best, _ = jax.lax.scan(least(_cylinder_distance), best, scene.cylinders)
+    return best.distance, best.shape
 
 
 def _normals(shapes: Shapes, kind: Int[Array, "N"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """Unit gradient of the distance to one chosen shape per point: of that shape alone, not the whole scene."""
+    """Unit gradient of the distance to one chosen shape per point, instead of to the whole scene."""
     carved = kind == 0
     soft = shapes._replace(
         half=shapes.half + jnp.where(carved, _SOFT_EDGE, 0.0)[:, None],

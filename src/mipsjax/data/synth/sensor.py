@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from mipsjax.core.camera import Intrinsics
 
@@ -22,7 +21,7 @@ class SensorModel(NamedTuple):
     noise_from: float = 0.4
     """Metres."""
     disparity_step: float = 0.0029
-    """Quantisation of inverse depth, 1/metres: an eighth of a pixel over 580 pixels of focal length and 7.5 cm."""
+    """Quantisation of inverse depth, 1/metres: 1/8 pixel over a focal length of 580 pixels and 7.5 cm."""
     jitter_px: float = 0.4
     """Standard deviation of where on the image a depth pixel looks, pixels."""
     range_min: float = 0.4
@@ -30,7 +29,7 @@ class SensorModel(NamedTuple):
     range_max: float = 6.0
     """Metres; farther surfaces are not measured."""
     edge_step: float = 0.04
-    """Relative depth step between neighbours from which a pixel counts as lying at an edge."""
+    """Relative step in depth from which a pixel counts as lying at an edge."""
     edge_loss: float = 0.55
     """Share of pixels lost at an edge."""
     grazing_deg: tuple[float, float] = (70.0, 86.0)
@@ -89,18 +88,32 @@ def _loss(
 
 
 def _at_edge(model: SensorModel, depth: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    near = minimum_filter(depth, size=3, mode="nearest")
-    return maximum_filter(depth, size=3, mode="nearest") - near > model.edge_step * near
+    """Where inverse depth bends: on a plane it is linear over the image, however slanted."""
+    inverse = np.pad(1.0 / depth, 1, mode="edge")
+    bends = np.diff(inverse, n=2, axis=0)[:, 1:-1], np.diff(inverse, n=2, axis=1)[1:-1]
+    return np.maximum(np.abs(bends[0]), np.abs(bends[1])) * depth > model.edge_step
 
 
 def incidence(depth: Float32[np.ndarray, "H W"], intrinsics: Intrinsics) -> Float[np.ndarray, "H W"]:
-    """Angle in radians between the line of sight and the surface's normal, from neighbouring pixels."""
+    """Angle in radians between the line of sight and the surface's normal, from the neighbouring pixels.
+
+    Of the neighbours on both sides the nearer in depth counts, so that a normal does not bridge an edge.
+    """
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
     sight = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(depth.shape)], axis=-1
+        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(depth.shape)],
+        axis=-1,
     )
     points = sight * depth[..., None]
-    normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    normal = np.cross(_tangent(points, axis=1), _tangent(points, axis=0))
     lengths = np.linalg.norm(normal, axis=-1) * np.linalg.norm(sight, axis=-1)
     cosine = np.abs(np.sum(normal * sight, axis=-1)) / np.maximum(lengths, np.finfo(np.float32).tiny)
     return np.arccos(np.clip(cosine, 0.0, 1.0))
+
+
+def _tangent(points: Float[np.ndarray, "H W 3"], axis: int) -> Float[np.ndarray, "H W 3"]:
+    """Difference to the next or to the previous pixel along an axis, whichever is smaller in depth."""
+    steps = np.diff(points, axis=axis)
+    first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
+    ahead, behind = np.concatenate([steps, last], axis=axis), np.concatenate([first, steps], axis=axis)
+    return np.where(np.abs(ahead[..., 2:]) < np.abs(behind[..., 2:]), ahead, behind)

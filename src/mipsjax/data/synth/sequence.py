@@ -34,7 +34,7 @@ class Degradations(NamedTuple):
 
 
 class SynthSequence:
-    """Frames of a synthetic sequence, rendered on access; satisfies `Sequence`. The same bits at every access."""
+    """Frames of a synthetic sequence, rendered on access, the same bits every time; a `Sequence`."""
 
     layout = "synth"
 

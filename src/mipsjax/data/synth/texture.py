@@ -23,7 +23,7 @@ _NOISE_CONTRAST = 1.9
 
 
 class Materials(NamedTuple):
-    """M materials: two colours mixed by a pattern, a weighted sum of noise, checks, stripes and wood grain."""
+    """M materials: two colours mixed by a weighted sum of noise, checks, stripes and wood grain."""
 
     dark: Float[Array, "*m 3"]
     """Linear RGB where the pattern is 0."""
@@ -35,9 +35,7 @@ class Materials(NamedTuple):
     """Share of noise, checks, stripes (along x), wood grain (along x) and painting, which colours by hue."""
 
 
-def albedo(
-    materials: Materials, index: Int[Array, "N"], points: Float[Array, "N 3"]
-) -> Float[Array, "N 3"]:
+def albedo(materials: Materials, index: Int[Array, "N"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
     """Linear RGB reflectance in 0..1 of points (metres, world frame) on given materials."""
     dark, bright, frequency, weights = (table[index] for table in materials)
     # A quarter cycle off, so that no pattern changes sign on the planes floors and walls lie in
@@ -87,7 +85,7 @@ def value_noise(at: Float[Array, "N 3"]) -> Float[Array, "N"]:
 
 
 def _lattice_value(x: UInt32[Array, "N"], y: UInt32[Array, "N"], z: UInt32[Array, "N"]) -> Float[Array, "N"]:
-    """A value in 0..1 for a lattice point, by multiplying with odd constants and mixing high bits into low."""
+    """A value in 0..1 for a lattice point: products with odd constants, high bits mixed into low ones."""
     h = x * jnp.uint32(0x9E3779B1) ^ y * jnp.uint32(0x85EBCA77) ^ z * jnp.uint32(0xC2B2AE3D)
     h = (h ^ (h >> 15)) * jnp.uint32(0x2C1B3C6D)
     h = (h ^ (h >> 12)) * jnp.uint32(0x297A2D39)
