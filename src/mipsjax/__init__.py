@@ -1,0 +1,89 @@
+"""Online neural RGB-D SLAM, as jitted pure functions and as a program.
+
+The names below are loaded when first used, so that importing the package starts no device and loads neither
+images nor meshes:
+
+    import mipsjax
+    cfg = mipsjax.preset("default")
+    sequence = mipsjax.open_sequence("synth:room")
+    state = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
+    state = mipsjax.step(state, sequence[1], cfg)
+    mesh = mipsjax.reconstruct_mesh(state, cfg)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mipsjax.config import PRESETS as PRESETS
+    from mipsjax.config import Config as Config
+    from mipsjax.config import preset as preset
+    from mipsjax.core.camera import Intrinsics as Intrinsics
+    from mipsjax.core.mapping import Submap as Submap
+    from mipsjax.core.mapping import refine as refine
+    from mipsjax.core.particles import fitness as fitness
+    from mipsjax.core.tracking import track as track
+    from mipsjax.data.open import open_sequence as open_sequence
+    from mipsjax.data.sequence import Frame as Frame
+    from mipsjax.data.sequence import Sequence as Sequence
+    from mipsjax.errors import ConfigError as ConfigError
+    from mipsjax.errors import InputError as InputError
+    from mipsjax.errors import MipsjaxError as MipsjaxError
+    from mipsjax.errors import OutputError as OutputError
+    from mipsjax.errors import TrackingLostError as TrackingLostError
+    from mipsjax.options import validate as validate
+    from mipsjax.policy import Status as Status
+    from mipsjax.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
+    from mipsjax.slam import SlamState as SlamState
+    from mipsjax.slam import start as start
+    from mipsjax.slam import step as step
+    from mipsjax.slam import trajectory as trajectory
+
+    __version__: str
+
+# `reconstruct_mesh` is not named after its function, since a package attribute cannot be both that function
+# and the module it is in.
+_PLACES = {
+    "PRESETS": "config:PRESETS",
+    "Config": "config:Config",
+    "ConfigError": "errors:ConfigError",
+    "Frame": "data.sequence:Frame",
+    "InputError": "errors:InputError",
+    "Intrinsics": "core.camera:Intrinsics",
+    "MipsjaxError": "errors:MipsjaxError",
+    "OutputError": "errors:OutputError",
+    "Sequence": "data.sequence:Sequence",
+    "SlamState": "slam:SlamState",
+    "Status": "policy:Status",
+    "Submap": "core.mapping:Submap",
+    "TrackingLostError": "errors:TrackingLostError",
+    "fitness": "core.particles:fitness",
+    "open_sequence": "data.open:open_sequence",
+    "preset": "config:preset",
+    "reconstruct_mesh": "reconstruct:reconstruct",
+    "refine": "core.mapping:refine",
+    "start": "slam:start",
+    "step": "slam:step",
+    "track": "core.tracking:track",
+    "trajectory": "slam:trajectory",
+    "validate": "options:validate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mipsjax")
+    if name not in _PLACES:
+        raise AttributeError(f"module 'mipsjax' has no attribute '{name}'")
+    module, attribute = _PLACES[name].split(":")
+    value = getattr(import_module(f"mipsjax.{module}"), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PLACES, "__version__"])

@@ -138,9 +138,9 @@ class SearchConfig:
 
     when: Literal["always", "needed", "never"] = "needed"
     """`needed`: only when gradient-based optimisation alone has not converged."""
-    particles: int = 2048
-    pixels: int = 160
-    steps: int = 10
+    particles: int = 1024
+    pixels: int = 96
+    steps: int = 8
     rotation: float = 0.12
     """First radius of the swarm in the imaginary part of the quaternion, half the angle in radians."""
     translation: float = 0.25
@@ -157,7 +157,7 @@ class SearchConfig:
     """Off: the fitness is not weighted (the paper's ablation "No U")."""
     entropy_floor: float = 0.3
     """Nats; bounds the weight 1 / h^2 of a certain point."""
-    residual: float = 0.018
+    residual: float = 0.012
     """Metres; gradient-based optimisation that ends above it has not converged."""
     inliers: float = 0.7
     """Share of pixels within 5 cm; gradient-based optimisation that ends below it has not converged."""
@@ -200,6 +200,25 @@ class TrackConfig:
 
 
 @dataclass(frozen=True)
+class MeshConfig:
+    """The surface that is written at the end."""
+
+    voxel: float = 0.02
+    """Metres, edge of a cell of marching cubes."""
+    margin: float = 0.06
+    """Metres; surface is sought this far from measured points."""
+    band: float = 0.08
+    """Metres; a cell is meshed where a corner is nearer to the surface. Below the truncation, so that the jump
+    of the truncated distance behind a surface is none."""
+    max_entropy: float = 0.96
+    """Share of the entropy of an even class distribution; where the field is less certain nothing is meshed."""
+    depth_max: float = 5.0
+    """Metres; measurements farther away do not count as observed surface."""
+    min_component_m2: float = 0.05
+    """Square metres; smaller detached pieces are dropped."""
+
+
+@dataclass(frozen=True)
 class Config:
     """All of it."""
 
@@ -211,6 +230,7 @@ class Config:
     track: TrackConfig = TrackConfig()
     keyframe: KeyframeConfig = KeyframeConfig()
     guard: GuardConfig = GuardConfig()
+    mesh: MeshConfig = MeshConfig()
     seed: int = 0
 
 
@@ -237,5 +257,6 @@ TINY = Config(
     sample=SampleConfig(uniform=4, truncation=6),
     map=MapConfig(steps=4, steps_slow=4, first_steps=60, pixels=64),
     track=TrackConfig(ro=SearchConfig(particles=128, pixels=48, steps=4), go=RefineConfig(pixels=192, steps=8, smooth_steps=4)),
+    mesh=MeshConfig(voxel=0.05),
 )
 PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

@@ -59,7 +59,7 @@ def pixel_grid(
 
 def grid_shape(pixels: int, height: int, width: int) -> tuple[int, int]:
     """Rows and columns of a grid of at most `pixels` cells, as square as the image allows."""
-    rows = max(1, int((pixels * height / width) ** 0.5))
+    rows = max(1, min(pixels, int((pixels * height / width) ** 0.5)))
     return rows, max(1, pixels // rows)
 
 
@@ -72,7 +72,7 @@ def rays(
 
 def transform(T_a_b: Float[Array, "4 4"], p_b: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
     """Points from frame b to frame a."""
-    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return p_b @ T_a_b[:3, :3].T + T_a_b[None, :3, 3]
 
 
 def project(p_cam: Float[Array, "P 3"], camera: Intrinsics) -> Float[Array, "P 2"]:

@@ -36,7 +36,7 @@ def emd(
         return jnp.zeros(())
     step = 2 * cfg.truncation / (cfg.classes - 1)
     nearest = jnp.round((target + cfg.truncation) / step)
-    away = jnp.abs(jnp.arange(cfg.classes) - nearest[:, None])
+    away = jnp.abs(jnp.arange(cfg.classes)[None] - nearest[:, None])
     return masked_mean(jnp.sum(jnp.exp(prediction.logits) * away, -1), mask)
 
 
@@ -47,7 +47,7 @@ def cross_entropy(
     if not cfg.classification:
         return jnp.zeros(())
     step = 2 * cfg.truncation / (cfg.classes - 1)
-    two_hot = jnp.maximum(0, 1 - jnp.abs(target[:, None] - class_values(cfg)) / step)
+    two_hot = jnp.maximum(0, 1 - jnp.abs(target[:, None] - class_values(cfg)[None]) / step)
     return masked_mean(-jnp.sum(two_hot * prediction.logits, -1), mask)
 
 

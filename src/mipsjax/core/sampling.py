@@ -32,7 +32,7 @@ def stratified(
 ) -> Float[Array, "P S"]:
     """One uniform draw in each of `count` equal parts of [lo, hi]."""
     jitter = jax.random.uniform(key, (lo.shape[0], count))
-    return lo[:, None] + (hi - lo)[:, None] * (jnp.arange(count) + jitter) / count
+    return lo[:, None] + (hi - lo)[:, None] * (jnp.arange(count)[None] + jitter) / count
 
 
 def first_phase(

@@ -1,0 +1,105 @@
+"""What the experiments share: run a sequence in this process, measure it, write rows."""
+
+from __future__ import annotations
+
+import csv
+import resource
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mipsjax import slam
+from mipsjax.config import Config
+from mipsjax.data.open import open_sequence
+from mipsjax.data.sequence import Sequence
+from mipsjax.host.metrics import absolute_error, relative_error
+
+DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+OUT = Path(__file__).resolve().parent / "out"
+WARM_UP = 5  # frames after which the clock starts: by then everything is compiled
+
+
+class Run(NamedTuple):
+    state: slam.SlamState
+    sequence: Sequence
+    row: dict[str, Any]
+
+
+def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -> Run:
+    """One whole sequence; the row holds the figures every table wants."""
+    cfg = replace(cfg, seed=seed)
+    sequence = open_sequence(path, frames=frames, input=cfg.input)
+    truth = sequence.T_world_cam
+    state = slam.start(sequence[0], sequence.intrinsics, cfg, None if truth is None else truth[0])
+    began = time.perf_counter()
+    for position in range(1, len(sequence)):
+        if position == WARM_UP:
+            began = time.perf_counter()
+        state = slam.step(state, sequence[position], cfg)
+    seconds = time.perf_counter() - began
+    row = {"sequence": Path(path).name, "frames": len(sequence), "stride": frames.step or 1, "seed": seed}
+    return Run(state, sequence, row | figures(state, sequence, seconds))
+
+
+def figures(state: slam.SlamState, sequence: Sequence, seconds: float) -> dict[str, Any]:
+    """ATE RMSE after rigid alignment over all frames, RPE over one frame, statuses, speed, memory."""
+    statuses = Counter(record.status.value for record in state.records)
+    timed = [record.info for record in state.records[WARM_UP:]]
+    row: dict[str, Any] = {}
+    if sequence.T_world_cam is not None:
+        poses = slam.trajectory(state)
+        ate, rpe = absolute_error(poses, sequence.T_world_cam), relative_error(poses, sequence.T_world_cam)
+        row |= {"ate_cm": 100 * ate.rmse_m, "ate_max_cm": 100 * ate.max_m, "rpe_cm": 100 * rpe.trans_rmse_m}
+    return row | {
+        "ok": statuses["ok"],
+        "weak": statuses["weak"],
+        "lost": statuses["lost"] + statuses["skipped"],
+        "keyframes": len(state.keyframes),
+        "ro_frames": sum(info.searched for info in timed),
+        "fps": (len(sequence) - WARM_UP) / seconds,
+        "track_ms": float(np.mean([info.track_ms for info in timed])),
+        "map_ms": float(np.mean([info.map_ms for info in timed])),
+        "map_bytes": map_bytes(state),
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def map_bytes(state: slam.SlamState) -> int:
+    """Size of the networks of the submap."""
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(state.submap.field))
+
+
+def changed(cfg: Config, section: str, **fields: Any) -> Config:
+    """`cfg` with fields of one (dotted) section replaced."""
+    head, _, rest = section.partition(".")
+    inner = getattr(cfg, head)
+    return replace(cfg, **{head: changed(inner, rest, **fields) if rest else replace(inner, **fields)})
+
+
+def write_rows(name: str, rows: Iterable[Mapping[str, Any]]) -> Path:
+    """A CSV in `experiments/out`, floats to 4 digits; the columns are those of all rows together."""
+    rows = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    OUT.mkdir(exist_ok=True)
+    path = OUT / f"{name}.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def show(row: Mapping[str, Any]) -> None:
+    """One line a run, at once, so that a long experiment can be watched."""
+    print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
+
+
+def use_compilation_cache() -> None:
+    """Compile each graph once over all experiments."""
+    jax.config.update("jax_compilation_cache_dir", str(OUT / "cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -1,0 +1,106 @@
+"""The command line: options by dotted names over a file over a preset, and its errors in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from mipsjax.config import PRESETS, Config, preset
+from mipsjax.data.open import parse_frames
+from mipsjax.errors import ConfigError
+from mipsjax.options import flat, read_toml, suggestion, validate
+
+PROGRAM = "python -m mipsjax.run"
+# An option that is given or not; the other switches have a `no-` form too
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Turns an RGB-D sequence into a camera trajectory and a coloured mesh.
+
+    The preset comes first, then the file of --config, then the options below. Exit codes: 0 done, 1 a bug of
+    ours, 2 wrong options, 3 unusable input, 4 tracking lost, 5 output cannot be written, 130 interrupted.
+    """
+
+    sequence: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE")]
+    """Folder of a sequence, or synth:NAME for a built-in one, such as synth:room."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for the results; runs/NAME if none is given, numbered where that has results."""
+    preset: Annotated[str, tyro.conf.arg(metavar="|".join(PRESETS))] = "default"
+    """Starting point of all options of the method."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    """Options of the method from a file, in the sections named below."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP:STEP")] = ":"
+    """Which frames, counted from 0, without STOP."""
+    layout: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Layout of the folder, where it cannot be told by looking."""
+    intrinsics: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FX FY CX CY [W H]")] = None
+    """Pixels of the depth image, or of an image of W x H."""
+    depth_scale: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
+    """Depth units per metre."""
+    no_mesh: Flag = False
+    """No mesh is made."""
+    quiet: Flag = False
+    """Prints nothing but errors."""
+    inspect: Flag = False
+    """Only says what the sequence is."""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = Config()  # noqa: RUF009 (frozen)
+
+
+def parse(arguments: list[str]) -> Options:
+    """Options of a command line, checked. `--help` exits on its own.
+
+    Raises:
+        ConfigError: an option, the preset or the config file is wrong.
+    """
+    early = _read(arguments, preset("default"))
+    base = preset(early.preset)
+    options = _read(arguments, base if early.config is None else read_toml(early.config, base))
+    validate(options.settings)
+    parse_frames(options.frames)
+    return options
+
+
+def _read(arguments: list[str], base: Config) -> Options:
+    """The command line over a config. Raises ConfigError with one line."""
+    default = Options(sequence=tyro.MISSING, settings=base)
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(Options, prog=PROGRAM, args=arguments, default=default)
+    except SystemExit as exit:
+        if exit.code in (0, None):
+            raise
+        raise ConfigError(_one_line(arguments, errors.getvalue())) from None
+
+
+def _one_line(arguments: list[str], text: str) -> str:
+    """What is wrong with a command line, from the message of tyro, which fills a screen."""
+    names = ["--" + name for name, _ in flat(Config())]
+    names += ["--" + item.name for item in fields(Options) if item.name not in ("sequence", "settings")]
+    known = {name.replace("_", "-") for name in names} | {"--help"}
+    for argument in arguments:
+        name = argument.split("=", 1)[0].replace("_", "-")
+        plain = re.sub(r"(^--|\.)no-", r"\1", name)
+        if name.startswith("--") and name not in known and plain not in known:
+            return f"unknown option {name}{suggestion(name, sorted(known))}"
+    if "Missing from" in text:
+        return "no sequence given; pass a folder, or synth:room for a built-in one"
+    return _first_block(text) or "wrong options"
+
+
+def _first_block(text: str) -> str:
+    """What a framed message says between its title and the next rule, as one line."""
+    lines = [line.strip(" │╭╮╰╯─-") for line in text.strip().splitlines()]
+    # A plain message has a rule below its title, one in a box has the title in the frame
+    start = 1 if text.lstrip().startswith("╭") else lines.index("") + 1 if "" in lines else 0
+    body = lines[start:]
+    end = body.index("") if "" in body else len(body)
+    return " ".join(" ".join(body[:end]).split())

@@ -1,0 +1,332 @@
+"""`python -m mipsjax.run SEQUENCE`: from an RGB-D sequence to a trajectory and a mesh."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import signal
+import sys
+import tempfile
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from types import FrameType
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from mipsjax import outputs, slam
+from mipsjax.commandline import Options, parse
+from mipsjax.config import Config, InputConfig, MeshConfig
+from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
+from mipsjax.data.sequence import Frame, Sequence
+from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
+from mipsjax.policy import Status
+from mipsjax.reconstruct import reconstruct
+from mipsjax.summary import FrameRow, Run, verdict
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+LINE_EVERY = 50
+"""Frames between two lines of progress where there is no terminal."""
+ANCHOR_MEASURED = 0.1
+"""Share of pixels with depth that the first frame of a map needs."""
+MIN_USABLE = 2
+"""Frames that make a sequence."""
+CACHE_FROM_S = 0.3
+"""Compilations that take less are not worth a file."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program; returns its exit code. Errors are one line on stderr."""
+    try:
+        with _bugs_saved_in(Path(tempfile.gettempdir())):
+            options = parse(sys.argv[1:] if arguments is None else arguments)
+            return _inspect(options) if options.inspect else _run(options)
+    except MipsjaxError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Callable[[Status], None]) -> Run:
+    """All frames in turn, until `stop` says so or too many are bad. `tell` hears the status of each.
+
+    The map starts with the first frame that has colour and enough depth; frames before it are passed over.
+    """
+    state: slam.SlamState | None = None
+    waited: list[FrameRow] = []
+    read_s: list[float] = []
+    step_s: list[float] = []
+    bad, core = 0, _of_the_method(cfg)
+    for position in range(len(sequence)):
+        if stop() or bad > cfg.input.max_bad_frames:
+            break
+        began = perf_counter()
+        frame = sequence[position]
+        read_s.append(perf_counter() - began)
+        if state is not None:
+            state = slam.step(state, frame, core)
+        elif reason := anchor_problem(frame):
+            waited.append(FrameRow(frame.index, frame.timestamp, Status.SKIPPED, slam.FrameInfo(note=reason)))
+        else:
+            state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
+        step_s.append(perf_counter() - began - read_s[-1])
+        status = Status.SKIPPED if state is None else state.records[-1].status
+        bad += status is Status.SKIPPED
+        tell(status)
+    too_bad = bad > cfg.input.max_bad_frames
+    end = "bad frames" if too_bad else "interrupted" if len(read_s) < len(sequence) else "done"
+    return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end)
+
+
+def anchor_problem(frame: Frame) -> str:
+    """Why a frame cannot start a map; empty if it can."""
+    if frame.color is None or frame.depth is None:
+        return frame.problem or "no image"
+    measured = float(np.mean(frame.depth > 0))
+    return "" if measured >= ANCHOR_MEASURED else f"depth in {100 * measured:.1f} % of the pixels only"
+
+
+def enable_cache() -> None:
+    """Lets JAX keep compiled programs in the user's cache folder; without a folder it does without.
+
+    A cache that the user has chosen (JAX_COMPILATION_CACHE_DIR) stays.
+    """
+    # A damaged entry is compiled anew: nothing that a user must know
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
+    if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(home) / "mipsjax" / f"xla-{version('jaxlib')}-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", CACHE_FROM_S)
+
+
+def _run(options: Options) -> int:
+    """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
+    cfg, say = options.settings, _teller(options.quiet)
+    enable_cache()
+    began = perf_counter()
+    sequence = _open(options)
+    opened_s = perf_counter() - began
+    folder = outputs.choose_folder(sequence.name, options.out, _source(options))
+    with outputs.claimed(folder), _bugs_saved_in(folder), _warnings(say) as remarks, _signals() as stop:
+        outputs.write_config(folder, cfg, _plain_options(options), sequence)
+        say("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
+        with _progress(len(sequence), options.quiet) as tell:
+            run = travel(sequence, cfg, stop, tell)
+        if run.state is None:
+            raise _nothing_usable(run)
+        began = perf_counter()
+        mesh = None if options.no_mesh else reconstruct(run.state, cfg)
+        seconds = {"open": opened_s, "mesh": perf_counter() - began}
+        content = outputs.write_results(folder, run, mesh, seconds, remarks)
+        say(_summary(content))
+        return _exit_code(run, folder)
+
+
+def _exit_code(run: Run, folder: Path) -> int:
+    """0 or 130. Raises InputError or TrackingLostError where the results are not whole; they are written by
+    then."""
+    if run.end == "interrupted":
+        print(f"interrupted: results up to then are in {folder}", file=sys.stderr)
+        return INTERRUPTED
+    rows = run.rows
+    bad = [row for row in rows if row.status is Status.SKIPPED]
+    if run.end == "bad frames":
+        raise InputError(
+            f"{len(bad)} of {len(rows)} frames are unusable, the last one: {bad[-1].info.note}; results up "
+            f"to then are in {folder}; --input.max-bad-frames allows more"
+        )
+    if len(rows) - len(bad) < MIN_USABLE:
+        raise InputError(f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}")
+    if verdict(rows) == "failed":
+        lost = [row.index for row in rows if row.status is Status.LOST]
+        raise TrackingLostError(
+            f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
+            f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"
+        )
+    return 0
+
+
+def _nothing_usable(run: Run) -> MipsjaxError | KeyboardInterrupt:
+    if run.end == "interrupted":
+        return KeyboardInterrupt()
+    reason = run.waited[-1].info.note if run.waited else "none was read"
+    return InputError(f"none of {len(run.waited)} frames has usable colour and depth, the last one: {reason}")
+
+
+def _inspect(options: Options) -> int:
+    print(describe(_open(options)))
+    return 0
+
+
+def _open(options: Options) -> Sequence:
+    sequence = open_sequence(
+        options.sequence,
+        layout=options.layout,
+        intrinsics=options.intrinsics,
+        depth_scale=options.depth_scale,
+        frames=parse_frames(options.frames),
+        input=options.settings.input,
+    )
+    if len(sequence) < MIN_USABLE:
+        raise InputError(f"{options.sequence}: 1 frame selected, at least {MIN_USABLE} are needed")
+    return sequence
+
+
+def _of_the_method(cfg: Config) -> Config:
+    """The config as compiled code sees it: options of reading and meshing must not compile tracking anew."""
+    return replace(cfg, input=InputConfig(), mesh=MeshConfig())
+
+
+def _true_pose(sequence: Sequence, position: int) -> slam.Pose | None:
+    """Where the first frame is in the world, if that is known."""
+    if sequence.T_world_cam is None or not np.isfinite(sequence.T_world_cam[position]).all():
+        return None
+    return sequence.T_world_cam[position]
+
+
+def _source(options: Options) -> Path | None:
+    return None if options.sequence.startswith(SYNTH_PREFIX) else Path(options.sequence)
+
+
+def _plain_options(options: Options) -> dict[str, Any]:
+    """The command line for config.json."""
+    values = {item.name: getattr(options, item.name) for item in fields(options) if item.name != "settings"}
+    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+
+
+def _summary(content: dict[str, Any]) -> str:
+    """One line at the end."""
+    fps, ate = content["fps"], content.get("ate_rmse_m")
+    parts = [f"{content['status']}: {content['frames']} frames in {content['seconds']:.1f} s"]
+    parts += [f"{fps:.1f} frames/s after compilation"] if fps else []
+    parts += [f"{content['keyframes']} keyframes"]
+    parts += [f"ATE {100 * ate:.2f} cm"] if ate is not None else []
+    return ", ".join(parts)
+
+
+def _teller(quiet: bool) -> Callable[[str], None]:
+    return (lambda text: None) if quiet else (lambda text: print(text, flush=True))
+
+
+@contextmanager
+def _progress(count: int, quiet: bool) -> Iterator[Callable[[Status], None]]:
+    """A function that is told of each frame: a bar on a terminal, or else a line now and then."""
+    if not quiet and sys.stderr.isatty():
+        with tqdm(total=count, unit="frame", file=sys.stderr) as bar:
+            yield lambda status: _advance(bar, status)
+        return
+    done, say = [0], _teller(quiet)
+
+    def tell(status: Status) -> None:
+        done[0] += 1
+        if done[0] % LINE_EVERY == 0 or done[0] == count:
+            say(f"frame {done[0]} of {count}: {status}")
+
+    yield tell
+
+
+def _advance(bar: tqdm, status: Status) -> None:
+    bar.set_postfix_str(status, refresh=False)
+    bar.update()
+
+
+@contextmanager
+def _signals() -> Iterator[Callable[[], bool]]:
+    """Whether SIGINT or SIGTERM has come. The next one then ends the process at once."""
+    came: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        came.append(number)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in before:
+            signal.signal(number, note)
+    except ValueError:  # not the main thread, where whoever runs it handles signals
+        before = {}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _warnings(say: Callable[[str], None]) -> Iterator[list[str]]:
+    """Collects what the library logs, and says it."""
+    texts: list[str] = []
+
+    class Collector(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            texts.append(record.getMessage())
+            say(f"{record.levelname.lower()}: {texts[-1]}")
+
+    handler, logger = Collector(logging.WARNING), logging.getLogger("mipsjax")
+    logger.addHandler(handler)
+    try:
+        yield texts
+    finally:
+        logger.removeHandler(handler)
+
+
+class _BugError(MipsjaxError):
+    """A bug of ours, with its traceback saved."""
+
+    exit_code = 1
+
+
+@contextmanager
+def _bugs_saved_in(folder: Path) -> Iterator[None]:
+    """Turns an unforeseen exception into one line and a file with its traceback."""
+    try:
+        yield
+    except MipsjaxError:
+        raise
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}".splitlines()[0]
+        path = folder / f"mipsjax-error-{os.getpid()}.txt"
+        try:
+            path.write_text(traceback.format_exc(), encoding="utf-8")
+            where = f"its traceback is in {path}"
+        except OSError as failure:
+            where = f"its traceback cannot be written ({failure.strerror})"
+        raise _BugError(f"a bug of mipsjax, please report it: {text}; {where}") from error
+
+
+def _processor() -> str:
+    """A short name for this kind of processor: compiled programs are for one kind only."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+        kind = "\n".join(
+            sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+        )
+    except OSError:
+        kind = platform.processor()
+    return hashlib.sha256(f"{platform.machine()} {kind}".encode()).hexdigest()[:12]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,219 @@
+"""A run in numbers: the content of metrics.json, each number that needs one with its protocol."""
+
+from __future__ import annotations
+
+import platform
+from time import perf_counter
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+import trimesh
+from jaxtyping import Float64
+
+from mipsjax.data.sequence import Sequence
+from mipsjax.data.synth import SynthSequence
+from mipsjax.errors import InputError
+from mipsjax.host import metrics, surface
+from mipsjax.policy import Status
+from mipsjax.slam import FrameInfo, SlamState, trajectory
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None
+
+SCHEMA_VERSION = 1
+"""Of the output files; rises when a key changes its meaning."""
+REFERENCE_VOXEL_M = 0.02
+"""Cells of the true mesh of synthetic scenes: vertices lie on the surface, only edges are cut."""
+MOST_VIEWS = 60
+"""Frames that decide which part of the true mesh was seen; more take long and add little."""
+
+Verdict = Literal["ok", "degraded", "failed"]
+
+
+class FrameRow(NamedTuple):
+    """One frame in status.csv."""
+
+    number: int
+    """In the sequence."""
+    timestamp: float
+    """Seconds."""
+    status: Status
+    info: FrameInfo
+
+
+class Run(NamedTuple):
+    """What a run has found out, whole or cut short."""
+
+    sequence: Sequence
+    state: SlamState | None
+    """None: no frame was good enough to start with."""
+    waited: tuple[FrameRow, ...]
+    """Frames before the first usable one."""
+    read_s: tuple[float, ...]
+    """Seconds to read each frame."""
+    step_s: tuple[float, ...]
+    """Seconds to process each frame."""
+    end: Literal["done", "interrupted", "bad frames"]
+
+    @property
+    def rows(self) -> tuple[FrameRow, ...]:
+        """All frames that were read."""
+        records = () if self.state is None else self.state.records
+        return self.waited + tuple(FrameRow(r.index, r.timestamp, r.status, r.info) for r in records)
+
+    @property
+    def T_truth_cam(self) -> Float64[np.ndarray, "N 4 4"] | None:
+        """Ground truth of the processed frames."""
+        if self.sequence.T_world_cam is None or self.state is None:
+            return None
+        first = len(self.waited)
+        return self.sequence.T_world_cam[first : first + len(self.state.records)]
+
+
+class Number(NamedTuple):
+    """A value of metrics.json that needs its protocol beside it; None where it cannot be told."""
+
+    value: float | int | None
+    protocol: str
+
+
+def verdict(rows: tuple[FrameRow, ...]) -> Verdict:
+    """`failed`: lost at the end, or in more than half of the frames, or never tracked; `degraded`: lost at
+    times."""
+    tracked = [row.status for row in rows if row.status is not Status.SKIPPED]
+    lost = tracked.count(Status.LOST)
+    if not tracked or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
+        return "failed"
+    return "degraded" if lost else "ok"
+
+
+def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, float]) -> dict[str, Any]:
+    """All numbers of metrics.json. `run` has a state."""
+    assert run.state is not None
+    rows, began = run.rows, perf_counter()
+    numbers = {**_speed(run), **trajectory_errors(run)}
+    if mesh is not None and isinstance(run.sequence, SynthSequence):
+        numbers |= surface_errors(run.sequence, run, mesh)
+    stages = {
+        "read": sum(run.read_s),
+        "frames": sum(run.step_s),
+        **seconds,
+        "evaluate": perf_counter() - began,
+    }
+    total = sum(stages.values())
+    stages["track"] = sum(row.info.track_ms for row in rows) / 1e3
+    stages["map"] = sum(row.info.map_ms for row in rows) / 1e3
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "status": verdict(rows),
+        "end": run.end,
+        "frames": len(rows),
+        "seconds": total,
+        "seconds_per_stage": stages,
+        "peak_memory_bytes": _peak_memory(),
+        "submaps": 1,
+        "keyframes": len(run.state.keyframes),
+        "loops": 0,
+        "status_counts": {str(status): [row.status for row in rows].count(status) for status in Status},
+        "ro_frames": sum(row.info.searched for row in rows),
+        "map_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(run.state.submap.field)),
+        "bad_frames": [
+            {"index": row.number, "reason": row.info.note}
+            for row in rows
+            if row.info.note and row.status != "lost"
+        ],
+        **{name: number.value for name, number in numbers.items()},
+        "protocol": {name: number.protocol for name, number in numbers.items()},
+    }
+
+
+def trajectory_errors(run: Run) -> dict[str, Number]:
+    """ATE, RPE and TE, each None where too few poses are known; empty without ground truth."""
+    truth = run.T_truth_cam
+    if truth is None or run.state is None:
+        return {}
+    poses = trajectory(run.state)
+    names = ("ate_rmse_m", "ate_mean_m", "rpe_trans_m", "rpe_rot_deg", "te_mean_m")
+    try:
+        absolute = metrics.absolute_error(poses, truth)
+        relative = metrics.relative_error(poses, truth)
+        translation = metrics.translation_error(poses, truth)
+    except InputError as error:
+        return {name: Number(None, str(error)) for name in names}
+    left_out = f"{absolute.poses} poses, {absolute.missing_truth} without truth left out, lost frames count"
+    ate = f"camera centres, rigid alignment, no scale; {left_out}"
+    rpe = f"all pairs of neighbouring frames, no alignment, {relative.pairs} pairs, RMSE"
+    te = "both seen from their first frame, no alignment, mean"
+    values = (
+        absolute.rmse_m,
+        absolute.mean_m,
+        relative.trans_rmse_m,
+        relative.rot_rmse_deg,
+        translation.mean_m,
+    )
+    return {
+        name: Number(*pair)
+        for name, pair in zip(names, zip(values, (ate, ate, rpe, rpe, te), strict=True), strict=True)
+    }
+
+
+def surface_errors(sequence: SynthSequence, run: Run, mesh: trimesh.Trimesh) -> dict[str, Number]:
+    """Errors of the mesh against the exact scene, as far as it was seen; None where there is no surface."""
+    from mipsjax.data.synth.mesh import reference_mesh
+
+    assert sequence.T_world_cam is not None
+    names = ("accuracy_m", "completeness_m", "completion_ratio", "f_score")
+    if len(mesh.faces) == 0:
+        return {name: Number(None, "the mesh is empty") for name in names}
+    first, count = len(run.waited), len(run.rows)
+    chosen = np.unique(np.linspace(first, count - 1, min(MOST_VIEWS, count - first)).astype(int))
+    depths = (sequence[int(position)].depth for position in chosen)
+    views = surface.Views(
+        sequence.T_world_cam[chosen], sequence.intrinsics, (depth for depth in depths if depth is not None)
+    )
+    try:
+        found = surface.compare_meshes(
+            mesh, reference_mesh(sequence.scene, REFERENCE_VOXEL_M), views
+        ).all_of_it
+    except InputError as error:
+        return {name: Number(None, str(error)) for name in names}
+    sampled = (
+        f"{found.points} points by area, not aligned, reference culled to what {len(chosen)} frames saw "
+        f"({surface.DEPTH_TOLERANCE_M * 100:g} cm tolerance), mesh not culled"
+    )
+    within = f"within {100 * found.threshold_m:g} cm; {sampled}"
+    how = (
+        f"mean distance mesh to reference; {sampled}",
+        f"mean distance reference to mesh; {sampled}",
+        f"part of the reference {within}",
+        f"harmonic mean of precision and completion ratio {within}",
+    )
+    return {name: Number(getattr(found, name), text) for name, text in zip(names, how, strict=True)}
+
+
+def _speed(run: Run) -> dict[str, Number]:
+    """Frames a second, with and without the two calls that compile."""
+    compiled = len(run.waited) + 2
+    steady = run.step_s[compiled:]
+    total = sum(run.step_s) + sum(run.read_s)
+    return {
+        "fps": Number(
+            len(steady) / sum(steady) if steady else None,
+            "processed frames a second without reading images; the first two frames, which compile, left out",
+        ),
+        "fps_overall": Number(
+            len(run.step_s) / total if total > 0 else None,
+            "all frames, with reading images and with compilation",
+        ),
+    }
+
+
+def _peak_memory() -> int | None:
+    """Bytes of memory the process has used at most."""
+    if resource is None:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if platform.system() == "Darwin" else 1024 * peak

@@ -1,0 +1,116 @@
+"""The program called in this process, and copies of one small sequence for it to fail on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from mipsjax.config import InputConfig
+from mipsjax.data.synth import open_synth
+from mipsjax.data.synth.export import export_tum
+from mipsjax.data.trajectory import known_poses, read_tum
+from mipsjax.run import main
+
+FRAMES = 12
+"""Of the exported sequence: enough for a second keyframe."""
+
+
+class Result(NamedTuple):
+    """What a call of the program left."""
+
+    code: int
+    stdout: str
+    stderr: str
+    out: Path
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        return json.loads((self.out / "metrics.json").read_text())
+
+    @property
+    def statuses(self) -> list[str]:
+        lines = (self.out / "status.csv").read_text().splitlines()[1:]
+        return [line.split(",")[2] for line in lines]
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (self.out / "events.jsonl").read_text().splitlines()]
+
+
+class Program:
+    """Calls `main` with the tiny preset and checks what holds for every call."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.out, self._capsys = folder / "out", capsys
+
+    def __call__(self, sequence: Path | str, *options: str, mesh: bool = False) -> Result:
+        more = [] if mesh else ["--no-mesh"]
+        more += [] if "--out" in options else ["--out", str(self.out)]
+        return self.plain(str(sequence), "--preset", "tiny", *more, *options)
+
+    def plain(self, *arguments: str) -> Result:
+        """Without any option of its own."""
+        self._capsys.readouterr()
+        with jax.numpy_rank_promotion("allow"):  # as users have it
+            code = main(list(arguments))
+        printed = self._capsys.readouterr()
+        out = Path(arguments[arguments.index("--out") + 1]) if "--out" in arguments else self.out
+        assert "Traceback" not in printed.out + printed.err
+        assert len(printed.err.strip().splitlines()) == (0 if code == 0 else 1), printed.err
+        check_outputs(out)
+        return Result(code, printed.out, printed.err, out)
+
+
+def check_outputs(out: Path) -> None:
+    """Whatever is there is whole, readable and finite, and nothing else is there."""
+    if (out / "trajectory.txt").exists():
+        found = read_tum(out / "trajectory.txt")
+        assert len(found.timestamps) and known_poses(found.T_world_cam).all()
+    for path in out.glob("*.json*"):
+        for line in [path.read_text()] if path.suffix == ".json" else path.read_text().splitlines():
+            json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
+    assert not [path for path in out.glob(".*") if path.name != ".lock"]
+
+
+@pytest.fixture
+def program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Program:
+    return Program(tmp_path, capsys)
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`synth:tiny` in the TUM layout."""
+    folder = tmp_path_factory.mktemp("exported") / "tiny"
+    export_tum(open_synth("tiny", slice(FRAMES), InputConfig()), folder, voxel_m=None)
+    return folder
+
+
+@pytest.fixture
+def sequence(exported: Path, tmp_path: Path) -> Iterator[Path]:
+    """A copy of it to spoil; the run must not add to it."""
+    copy = tmp_path / "sequence"
+    shutil.copytree(exported, copy)
+    yield copy
+
+
+def image(folder: Path, kind: str, number: int) -> Path:
+    """File of one frame; `kind` is rgb or depth."""
+    return sorted((folder / kind).iterdir())[number]
+
+
+def read(path: Path) -> np.ndarray:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    return pixels
+
+
+def write(path: Path, pixels: np.ndarray) -> None:
+    assert cv2.imwrite(str(path), pixels)

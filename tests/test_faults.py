@@ -1,0 +1,336 @@
+"""The fault cases of the reliability contract, by their numbers, on copies of a small sequence."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+import running
+from mipsjax import slam
+from running import FRAMES, Program, Result, image, read, write
+
+# Fixtures: as assignments, so that parameters of the same name are no redefinitions of an import
+exported, program, sequence = running.exported, running.program, running.sequence
+
+BAD = 5
+"""The frame that is spoiled."""
+
+
+def spoil(folder: Path, kind: str, change: Callable[[bytes], bytes]) -> None:
+    path = image(folder, kind, BAD)
+    path.write_bytes(change(path.read_bytes()))
+
+
+def flipped(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 0x10]) + data[middle + 1 :]
+
+
+def edit_depth(folder: Path, numbers: range, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    for number in numbers:
+        path = image(folder, "depth", number)
+        write(path, change(read(path)))
+
+
+def edit_camera(folder: Path, **values: float) -> None:
+    path = folder / "camera.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def is_good(result: Result) -> bool:
+    return result.code == 0 and result.metrics["status"] == "ok"
+
+
+def test_01_missing_folder_or_a_file(program: Program, sequence: Path) -> None:
+    result = program(sequence / "nothing" / "here")
+    assert result.code == 3 and str(sequence / "nothing") in result.stderr and str(sequence) in result.stderr
+    result = program(sequence / "rgb.txt")
+    assert result.code == 3 and "rgb.txt" in result.stderr
+    assert not program.out.exists()
+
+
+def test_02_unknown_layout(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    result = program(tmp_path / "empty")
+    assert result.code == 3 and "tum" in result.stderr and "nothing" in result.stderr
+
+
+def test_03_two_layouts(program: Program, sequence: Path) -> None:
+    (sequence / "color").mkdir()
+    result = program(sequence)
+    assert result.code == 3 and "--layout" in result.stderr
+    assert is_good(program(sequence, "--layout", "tum"))
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+def test_04_05_missing_image(program: Program, sequence: Path, kind: str) -> None:
+    image(sequence, kind, BAD).unlink()
+    result = program(sequence)
+    assert is_good(result)
+    assert result.statuses.count("skipped") == (kind == "depth")
+    assert [bad["index"] for bad in result.metrics["bad_frames"]] == [BAD]
+    assert result.metrics["frames"] == FRAMES
+
+
+@pytest.mark.parametrize("change", [lambda data: b"", lambda data: data[: len(data) // 2], flipped])
+def test_06_07_08_damaged_depth(
+    program: Program,
+    sequence: Path,
+    change: Callable[[bytes], bytes],
+) -> None:
+    spoil(sequence, "depth", change)
+    result = program(sequence)
+    assert is_good(result) and result.statuses[BAD] == "skipped"
+    (event,) = [event for event in result.events if event["event"] == "bad_frame"]
+    assert event["index"] == BAD and event["reason"].startswith("unreadable_depth")
+
+
+def test_09_truncated_jpeg_keeps_its_depth(program: Program, sequence: Path) -> None:
+    path = image(sequence, "rgb", BAD)
+    _, data = cv2.imencode(".jpg", read(path))
+    path.write_bytes(data.tobytes()[: len(data) // 2])
+    result = program(sequence)
+    assert is_good(result) and result.statuses[BAD] == "ok"
+    assert "truncated JPEG" in result.metrics["bad_frames"][0]["reason"]
+
+
+def test_10_one_frame_of_another_size(program: Program, sequence: Path) -> None:
+    write(image(sequence, "depth", BAD), np.full((30, 40), 5000, np.uint16))
+    result = program(sequence)
+    assert is_good(result) and result.statuses[BAD] == "skipped"
+    assert "40 x 30" in result.metrics["bad_frames"][0]["reason"]
+
+
+@pytest.mark.parametrize(("size", "code"), [((160, 120), 0), ((80, 80), 3)])
+def test_11_colour_of_another_size(
+    program: Program,
+    sequence: Path,
+    size: tuple[int, int],
+    code: int,
+) -> None:
+    for number in range(FRAMES):
+        path = image(sequence, "rgb", number)
+        write(path, cv2.resize(read(path), size))
+    result = program(sequence)
+    assert result.code == code
+    assert f"{size[0]} x {size[1]}" in result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("pixels", [np.full((60, 80), 9, np.uint8), np.full((60, 80, 3), 9, np.uint16)])
+def test_12_depth_of_a_wrong_type(program: Program, sequence: Path, pixels: np.ndarray) -> None:
+    edit_depth(sequence, range(FRAMES), lambda _: pixels)
+    result = program(sequence)
+    assert result.code == 3 and "16-bit single channel" in result.stderr and ".png" in result.stderr
+
+
+def test_13_one_frame_without_depth(program: Program, sequence: Path) -> None:
+    edit_depth(sequence, range(BAD, BAD + 1), np.zeros_like)
+    result = program(sequence)
+    assert is_good(result) and result.statuses[BAD] == "skipped"
+
+
+def test_14_waits_for_the_first_usable_frame(program: Program, sequence: Path) -> None:
+    edit_depth(sequence, range(BAD), np.zeros_like)
+    result = program(sequence)
+    assert is_good(result)
+    assert result.statuses == ["skipped"] * BAD + ["ok"] * (FRAMES - BAD)
+    assert result.metrics["ate_rmse_m"] < 0.05
+
+
+def test_14_nothing_usable(program: Program, sequence: Path) -> None:
+    edit_depth(sequence, range(1, FRAMES), np.zeros_like)
+    image(sequence, "rgb", 0).unlink()
+    result = program(sequence)
+    assert result.code == 3 and "usable" in result.stderr
+
+
+def test_15_hardly_any_pixel(program: Program, sequence: Path) -> None:
+    keep = np.random.default_rng(0).random((60, 80)) < 0.01
+    edit_depth(sequence, range(BAD, BAD + 1), lambda depth: np.where(keep, depth, 0).astype(np.uint16))
+    before = slam.tracking.track._cache_size()
+    assert program(sequence).code == 0
+    assert slam.tracking.track._cache_size() <= before + 1
+
+
+def test_17_saturated_pixels(program: Program, sequence: Path) -> None:
+    def saturate(depth: np.ndarray) -> np.ndarray:
+        depth[:20] = 65535
+        return depth
+
+    edit_depth(sequence, range(FRAMES), saturate)
+    assert is_good(program(sequence))
+
+
+def test_18_depth_scale(program: Program, sequence: Path) -> None:
+    result = program(sequence, "--depth-scale", "5e6")
+    assert result.code == 3 and "--depth-scale" in result.stderr and "median depth" in result.stderr
+    result = program(sequence, "--depth-scale", "500", "--inspect")
+    assert result.code == 0 and "is --depth-scale right?" in result.stdout
+
+
+def test_19_intrinsics(program: Program, sequence: Path) -> None:
+    assert program(sequence, "--intrinsics", "65", "65", "39", "400").code == 3
+    assert program(sequence, "--intrinsics", "65", "-65", "39", "29", "--inspect").code == 0
+    edit_camera(sequence, fy=-65.0)
+    result = program(sequence)
+    assert result.code == 3 and "--intrinsics" in result.stderr
+
+
+@pytest.mark.parametrize("rows", ["nan", "none", "few"])
+def test_26_28_holes_in_the_ground_truth(program: Program, sequence: Path, rows: str) -> None:
+    path = sequence / "groundtruth.txt"
+    lines = path.read_text().splitlines()
+    if rows == "none":
+        path.unlink()
+    elif rows == "few":
+        path.write_text("\n".join(lines[:3]) + "\n")
+    else:
+        spoiled = [
+            f"{line.split()[0]} nan inf 0 0 0 0 1" if n > BAD else line for n, line in enumerate(lines)
+        ]
+        path.write_text("\n".join(spoiled) + "\n")
+    result = program(sequence)
+    assert is_good(result)
+    if rows == "none":
+        assert "ate_rmse_m" not in result.metrics and not (result.out / "trajectory_gt.txt").exists()
+    elif rows == "few":
+        assert result.metrics["ate_rmse_m"] is None and "at least" in result.metrics["protocol"]["ate_rmse_m"]
+    else:
+        assert f"{FRAMES - BAD} without truth" in result.metrics["protocol"]["ate_rmse_m"]
+        assert result.metrics["ate_rmse_m"] < 0.05
+
+
+def test_27_poses_that_are_hardly_rotations(program: Program, sequence: Path) -> None:
+    (sequence / "rgb").rename(sequence / "color")
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (sequence / name).unlink()
+    skewed = np.tile(np.eye(4), (FRAMES, 1, 1))
+    skewed[:, :3, :3] *= 1 + 4e-4
+    skewed[BAD, 0] *= -1
+    np.savetxt(sequence / "poses.txt", skewed.reshape(FRAMES, 16))
+    result = program(sequence, "--layout", "folder", "--depth-scale", "5000")
+    assert is_good(result) and "mirrored" in result.stdout
+    assert "1 without truth" in result.metrics["protocol"]["ate_rmse_m"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_40_41_a_signal_finishes_the_frame(
+    program: Program,
+    sequence: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+) -> None:
+    step = slam.step
+
+    def interrupted(state: slam.SlamState, *rest: object) -> slam.SlamState:
+        if len(state.records) == BAD:
+            os.kill(os.getpid(), number)
+        return step(state, *rest)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(slam, "step", interrupted)
+    before = signal.getsignal(number)
+    result = program(sequence)
+    assert result.code == 130 and result.metrics["end"] == "interrupted"
+    assert result.metrics["frames"] == BAD + 1
+    assert signal.getsignal(number) == before
+
+
+def test_40_second_interrupt_ends_at_once(exported: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "mipsjax.run", str(exported), "--preset", "tiny", "--out", str(out)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir or "")}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as run:
+        assert run.stdout is not None and run.stderr is not None
+        assert "results in" in run.stdout.readline()
+        for _ in range(2):
+            run.send_signal(signal.SIGINT)
+        errors = run.stderr.read()
+        # Killed by the signal, or 130 where both came while one frame was in work and counted as one
+        assert run.wait(timeout=120) in (-signal.SIGINT, 130)
+    assert "Traceback" not in errors
+
+
+def test_46_folder_cannot_be_written(program: Program, sequence: Path) -> None:
+    for out in (sequence / "rgb.txt" / "out", Path("/proc/nowhere")):
+        result = program(sequence, "--out", str(out))
+        assert result.code == 5 and str(out) in result.stderr
+
+
+def test_48_49_results_and_running_runs_are_left_alone(
+    program: Program,
+    sequence: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(sequence.parent)
+    short = (str(sequence), "--preset", "tiny", "--frames", ":3", "--no-mesh")
+    assert program.plain(*short).code == 0
+    first = (sequence.parent / "runs" / "sequence" / "metrics.json").read_bytes()
+    assert program.plain(*short).code == 0
+    assert (sequence.parent / "runs" / "sequence-2" / "metrics.json").exists()
+    result = program.plain(*short, "--out", "runs/sequence")
+    assert result.code == 5 and "finished run" in result.stderr
+    assert (sequence.parent / "runs" / "sequence" / "metrics.json").read_bytes() == first
+
+
+def test_input_is_never_written_to(program: Program, sequence: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in sequence.rglob("*")}
+    assert program(sequence, "--out", str(sequence / "out")).code == 5
+    assert is_good(program(sequence))
+    assert {path: path.stat().st_mtime_ns for path in sequence.rglob("*")} == before
+
+
+def test_53_empty_mesh(program: Program, sequence: Path) -> None:
+    result = program(sequence, "--mesh.depth-max", "0.05", "--frames", ":3", mesh=True)
+    assert result.code == 0 and "mesh is empty" in result.stdout
+    assert (result.out / "mesh.ply").read_bytes().startswith(b"ply")
+    assert [event for event in result.events if event["event"] == "warning"]
+
+
+def test_54_one_frame(program: Program, sequence: Path) -> None:
+    assert program(sequence, "--frames", ":1").code == 3
+    assert program("synth:tiny", "--frames", ":1").code == 3
+
+
+def test_too_many_bad_frames(program: Program, sequence: Path) -> None:
+    edit_depth(sequence, range(3, FRAMES), np.zeros_like)
+    result = program(sequence, "--input.max-bad-frames", "4")
+    assert result.code == 3 and "--input.max-bad-frames" in result.stderr
+    assert result.metrics["frames"] == 8 and result.metrics["end"] == "bad frames"
+
+
+@pytest.mark.parametrize(
+    ("lost", "code", "status"), [(range(5, 7), 0, "degraded"), (range(8, FRAMES), 4, "failed")]
+)
+def test_lost_for_a_while_and_for_good(
+    program: Program,
+    sequence: Path,
+    lost: range,
+    code: int,
+    status: str,
+) -> None:
+    # Noise fits nowhere; a wall right before the camera may be taken for one of the map
+    rng = np.random.default_rng(0)
+    edit_depth(sequence, lost, lambda depth: rng.integers(5000, 30000, depth.shape).astype(np.uint16))
+    result = program(sequence)
+    assert result.code == code and result.metrics["status"] == status
+    assert result.metrics["status_counts"]["lost"] == len(lost)
+    assert [event["index"] for event in result.events if event["event"] == "lost"] == list(lost)
+
+
+def test_57_odd_path_and_link(program: Program, sequence: Path) -> None:
+    shutil.move(sequence, sequence.parent / "ein Weg ü")
+    (sequence.parent / "link").symlink_to(sequence.parent / "ein Weg ü")
+    assert is_good(program(sequence.parent / "link", "--frames", ":4"))

@@ -1,0 +1,188 @@
+"""The output folder: claimed, complete, atomic, and readable whatever the numbers are."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from mipsjax import outputs, slam
+from mipsjax.config import Config, preset
+from mipsjax.core import mapping
+from mipsjax.data.open import open_sequence
+from mipsjax.data.synth import SynthSequence
+from mipsjax.errors import OutputError
+from mipsjax.host.render import write_atomically
+from mipsjax.policy import Status
+from mipsjax.reconstruct import observed_points, reconstruct
+from mipsjax.summary import FrameRow, Run, metrics_content, verdict
+
+CFG = preset("tiny")
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """Three frames that were never mapped: poses and keyframes as after a run, without its time."""
+    sequence = open_sequence("synth:tiny", frames=slice(4))
+    assert isinstance(sequence, SynthSequence) and sequence.T_world_cam is not None
+    frames = [sequence[position] for position in range(4)]
+    keyframe = slam._keyframe(frames[1], 0, np.eye(4), CFG, sequence.intrinsics)
+    infos = [
+        slam.FrameInfo(),
+        slam.FrameInfo(residual_after=float("inf"), note='no, "depth"'),
+        slam.FrameInfo(),
+    ]
+    records = tuple(
+        slam.Record(frame.index, frame.timestamp, 0, np.eye(4), status, info)
+        for frame, info, status in zip(frames[1:], infos, (Status.OK, Status.SKIPPED, Status.OK), strict=True)
+    )
+    submap = mapping.create(jax.random.key(0), CFG)
+    state = slam.SlamState(submap, (keyframe,), records, sequence.T_world_cam[1], sequence.intrinsics, 0)
+    waited = (FrameRow(0, 0.0, Status.SKIPPED, slam.FrameInfo(note="no depth")),)
+    return Run(sequence, state, waited, (0.1,) * 4, (0.2,) * 4, "done")
+
+
+def row(status: str) -> FrameRow:
+    return FrameRow(0, 0.0, Status(status), slam.FrameInfo())
+
+
+@pytest.mark.parametrize(
+    ("statuses", "expected"),
+    [
+        ("ok ok", "ok"),
+        ("skipped ok weak skipped", "ok"),
+        ("ok lost ok", "degraded"),
+        ("ok lost lost lost ok ok", "degraded"),
+        ("ok lost lost lost ok", "failed"),
+        ("ok ok ok lost", "failed"),
+        ("ok ok ok lost skipped", "failed"),
+        ("skipped skipped", "failed"),
+    ],
+)
+def test_verdict(statuses: str, expected: str) -> None:
+    assert verdict(tuple(row(status) for status in statuses.split())) == expected
+
+
+def test_metrics_count_what_happened(run: Run) -> None:
+    content = metrics_content(run, None, {"open": 1.0})
+    assert content["frames"] == 4 and content["status_counts"] == {
+        "ok": 2,
+        "weak": 0,
+        "lost": 0,
+        "skipped": 2,
+    }
+    assert [bad["index"] for bad in content["bad_frames"]] == [0, 2]
+    # One steady frame after the one passed over and the two that compile: 0.2 s
+    assert content["fps"] == pytest.approx(5.0) and content["fps_overall"] == pytest.approx(4 / 1.2)
+    assert content["te_mean_m"] > 0 and content["seconds"] >= 2.2
+
+
+def test_files_are_readable_with_odd_numbers(run: Run, tmp_path: Path) -> None:
+    outputs.write_results(tmp_path, run, trimesh.Trimesh(), {"mesh": float("nan")}, ["a warning"])
+    metrics = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert metrics["seconds_per_stage"]["mesh"] is None and metrics["accuracy_m"] is None
+    lines = (tmp_path / "status.csv").read_text().splitlines()
+    assert len(lines) == 5 and lines[0].startswith(
+        "index,timestamp,status,residual_before_m,residual_after_m,"
+    )
+    assert lines[3].endswith('"no, ""depth"""') and ",inf" not in lines[3]
+    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [event["event"] for event in events] == ["bad_frame", "bad_frame", "warning", "end"]
+
+
+@pytest.mark.parametrize("call", range(6))
+def test_47_full_disk_leaves_no_half_file(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    calls = []
+
+    def full(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) > call:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    # Rendering takes long
+    monkeypatch.setattr(outputs, "save_picture", lambda path, *_: write_atomically(path, b"a picture"))
+    with pytest.raises(OutputError, match="No space left"):
+        outputs.write_results(tmp_path, run, trimesh.creation.box(), {}, [])
+    assert len(list(tmp_path.iterdir())) == call and not (tmp_path / "metrics.json").exists()
+
+
+def test_numbered_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for expected in ("a", "a-2", "a-3"):
+        folder = outputs.choose_folder("a", None, None)
+        assert folder == Path("runs") / expected
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").touch()
+    with pytest.raises(OutputError, match="finished run"):
+        outputs.choose_folder("a", folder, None)
+    assert outputs.choose_folder("a/b", None, None) == Path("runs/a-b")
+
+
+def test_lock(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    with outputs.claimed(folder):
+        with (
+            pytest.raises(OutputError, match=f"in use by another run.*{os.getpid()}"),
+            outputs.claimed(folder),
+        ):
+            pass
+        (folder / "result").touch()
+    assert [path.name for path in folder.iterdir()] == ["result"]
+    (folder / ".lock").write_text("process 1 on a machine that died\n")
+    with outputs.claimed(folder):
+        assert str(os.getpid()) in (folder / ".lock").read_text()
+
+
+def test_an_empty_folder_is_not_left_behind(tmp_path: Path) -> None:
+    with outputs.claimed(tmp_path / "new"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with outputs.claimed(tmp_path):
+        pass
+    assert tmp_path.exists()
+
+
+def test_output_in_the_input_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="lies in the input"):
+        outputs.choose_folder("a", tmp_path / "deep" / "out", tmp_path)
+
+
+def test_observed_points_are_those_of_the_scene(run: Run) -> None:
+    assert run.state is not None and isinstance(run.sequence, SynthSequence)
+    points = observed_points(run.state, CFG)
+    distance = run.sequence.scene.distance(jnp.asarray(points))
+    # Rays end within 0.2 mm of a surface, those that graze an edge within a few millimetres
+    assert len(points) and float(jnp.abs(distance).max()) < 5e-3 and float(jnp.abs(distance).mean()) < 2e-4
+
+
+def test_53_a_field_that_is_not_finite_gives_an_empty_mesh(
+    run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert run.state is not None
+    submap = jax.tree.map(
+        lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, run.state.submap
+    )
+    with jax.numpy_rank_promotion("allow"):
+        mesh = reconstruct(run.state._replace(submap=submap), CFG)
+    assert len(mesh.faces) == 0 and "mesh is empty" in caplog.text
+
+
+def test_config_file_has_no_infinity(run: Run, tmp_path: Path) -> None:
+    cfg: Config = preset("paper")
+    options: dict[str, Any] = {"intrinsics": (1.0, float("nan"))}
+    outputs.write_config(tmp_path, cfg, options, run.sequence)
+    content = json.loads((tmp_path / "config.json").read_text(), parse_constant=pytest.fail)
+    assert (
+        content["config"]["keyframe"]["translation"] == "inf" and content["options"]["intrinsics"][1] is None
+    )

@@ -1,0 +1,87 @@
+"""The decisions as tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from mipsjax.config import Config, GuardConfig, KeyframeConfig, MapConfig, SearchConfig, TrackConfig
+from mipsjax.policy import FrameStats, Status, decide, widening
+
+CFG = Config(
+    map=MapConfig(steps=10, steps_slow=4, motion=0.1),
+    keyframe=KeyframeConfig(known=0.65, every_frames=3, translation=0.2, rotation=0.15),
+    guard=GuardConfig(weak=0.6, lost=0.4),
+    track=TrackConfig(ro=SearchConfig(widening=1.5, widening_limit=3.0)),
+)
+# An ordinary frame: all known, near the last keyframe, hardly moved
+PLAIN = FrameStats(
+    finite=True, known=0.9, since_keyframe=5, translation=0.05, rotation=0.02, step_translation=0.0, step_rotation=0.0
+)
+
+
+@pytest.mark.parametrize(
+    ("finite", "known", "status"),
+    [
+        (True, 1.0, Status.OK),
+        (True, 0.6, Status.OK),
+        (True, 0.59, Status.WEAK),
+        (True, 0.4, Status.WEAK),
+        (True, 0.39, Status.LOST),
+        (True, 0.0, Status.LOST),
+        (False, 1.0, Status.LOST),
+        (False, float("nan"), Status.LOST),
+    ],
+)
+def test_status(finite, known, status):
+    assert decide(PLAIN._replace(finite=finite, known=known), CFG).status is status
+
+
+@pytest.mark.parametrize(
+    ("change", "keyframe"),
+    [
+        ({}, False),
+        ({"translation": 0.25}, True),
+        ({"rotation": 0.2}, True),
+        ({"known": 0.64}, True),
+        ({"known": 0.65}, False),
+        ({"translation": 0.25, "since_keyframe": 2}, False),
+        ({"translation": 0.25, "since_keyframe": 3}, True),
+        ({"known": 0.5, "since_keyframe": 2}, False),
+    ],
+)
+def test_keyframe(change, keyframe):
+    assert decide(PLAIN._replace(**change), CFG).keyframe is keyframe
+
+
+@pytest.mark.parametrize(
+    ("translation", "rotation", "steps"),
+    [(0.0, 0.0, 4), (0.05, 0.0, 7), (0.0, 0.05, 7), (0.05, 0.1, 10), (0.1, 0.0, 10), (9.0, 0.0, 10)],
+)
+def test_mapping_effort_grows_with_the_motion(translation, rotation, steps):
+    stats = PLAIN._replace(step_translation=translation, step_rotation=rotation)
+    assert decide(stats, CFG).map_steps == steps
+
+
+def test_nothing_is_learned_from_a_lost_frame():
+    decision = decide(PLAIN._replace(known=0.1, translation=9.0), CFG)
+    assert decision.status is Status.LOST and not decision.keyframe and decision.map_steps == 0
+
+
+def test_a_weak_frame_is_mapped():
+    decision = decide(PLAIN._replace(known=0.5), CFG)
+    assert decision.status is Status.WEAK and decision.keyframe and decision.map_steps > 0
+
+
+def test_the_papers_spacing_of_keyframes():
+    cfg = replace(CFG, keyframe=replace(CFG.keyframe, every_frames=30, translation=float("inf"), rotation=float("inf")))
+    far = PLAIN._replace(known=0.62, translation=5.0, rotation=3.0)
+    assert not decide(far._replace(since_keyframe=29), cfg).keyframe
+    assert decide(far._replace(since_keyframe=30), cfg).keyframe
+    assert not decide(far._replace(since_keyframe=30, known=0.7), cfg).keyframe
+
+
+@pytest.mark.parametrize(("trouble", "factor"), [(0, 1.0), (1, 1.5), (2, 2.25), (3, 3.0), (100, 3.0), (10_000, 3.0)])
+def test_the_search_widens_with_trouble_up_to_a_limit(trouble, factor):
+    assert widening(trouble, CFG) == pytest.approx(factor)

@@ -1,0 +1,146 @@
+"""The host loop on a small synthetic sequence: what is compiled, what repeats, and what a bad frame may not touch."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from mipsjax import slam
+from mipsjax.config import PRESETS, InputConfig
+from mipsjax.data.sequence import Frame
+from mipsjax.data.synth import open_synth
+from mipsjax.policy import Status
+
+CFG = PRESETS["tiny"]
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return open_synth("tiny", slice(FRAMES), InputConfig())
+
+
+@pytest.fixture(scope="module")
+def frames(sequence) -> list[Frame]:
+    return [sequence[i] for i in range(FRAMES)]
+
+
+def run(frames: list[Frame], camera) -> slam.SlamState:
+    state = slam.start(frames[0], camera, CFG)
+    for frame in frames[1:]:
+        state = slam.step(state, frame, CFG)
+    return state
+
+
+@pytest.fixture(scope="module")
+def finished(frames, sequence) -> slam.SlamState:
+    return run(frames, sequence.intrinsics)
+
+
+def same_map(a: slam.SlamState, b: slam.SlamState) -> bool:
+    """Bit for bit the same networks, optimiser and keyframes."""
+
+    def leaves(state):
+        return jax.tree.leaves((state.submap, [k._replace(number=0) for k in state.keyframes]))
+
+    return len(a.keyframes) == len(b.keyframes) and all(map(np.array_equal, leaves(a), leaves(b)))
+
+
+def test_frames_are_tracked(finished, sequence):
+    assert len(finished.records) == FRAMES
+    assert [r.index for r in finished.records] == list(range(FRAMES))
+    assert all(r.status is Status.OK for r in finished.records) and finished.trouble == 0
+    truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
+    error = np.linalg.norm(slam.trajectory(finished)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    # Tens of pixels and a few steps on purpose; the camera itself moves by more than this
+    assert error.max() < 0.03
+
+
+def test_poses_are_rigid(finished):
+    for T in slam.trajectory(finished):
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1, abs=1e-9)
+        np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_the_first_pose_is_the_one_asked_for(frames, sequence, finished):
+    np.testing.assert_array_equal(slam.trajectory(finished)[0], np.eye(4))
+    T = sequence.T_world_cam[0]
+    state = slam.start(frames[0], sequence.intrinsics, CFG, T)
+    np.testing.assert_allclose(slam.trajectory(state)[0], T, atol=1e-12)
+
+
+def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, sequence, finished):
+    compiled: list[str] = []
+
+    def listen(event: str, duration: float, **details) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(str(details))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        again = run(frames, sequence.intrinsics)
+        blind = slam.step(again, frames[0]._replace(depth=None, problem="gone"), CFG)
+        slam.step(blind, frames[5]._replace(color=None), CFG)
+        assert not compiled
+        jax.jit(lambda x: x * 7)(np.float32(1))
+        assert compiled, "the listener hears compilations"
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    np.testing.assert_array_equal(slam.trajectory(again), slam.trajectory(finished))
+    assert same_map(again, finished)
+
+
+def following(frame: Frame) -> Frame:
+    return frame._replace(index=FRAMES, timestamp=frame.timestamp + 1 / 30)
+
+
+@pytest.mark.parametrize("how", ["missing", "zero"])
+def test_a_frame_without_depth_is_skipped_and_counted(finished, frames, how):
+    depth = None if how == "missing" else np.zeros_like(frames[-1].depth)
+    bad = following(frames[-1])._replace(depth=depth, problem="cut short" if how == "missing" else "")
+    after = slam.step(finished, bad, CFG)
+    record = after.records[-1]
+    assert len(after.records) == FRAMES + 1 and record.status is Status.SKIPPED
+    assert record.info.note == ("cut short" if how == "missing" else "no depth")
+    assert after.trouble == 1 and same_map(after, finished)
+    np.testing.assert_allclose(slam.trajectory(after)[-1], slam.trajectory(after)[-2], atol=1e-12)
+
+
+def test_a_frame_without_color_is_tracked_but_not_mapped(finished, frames):
+    after = slam.step(finished, following(frames[-1])._replace(color=None), CFG)
+    record = after.records[-1]
+    assert record.status is Status.OK and record.info.map_steps == 0 and not record.info.keyframe
+    assert same_map(after, finished)
+    # The same view as the frame before, so about the same pose
+    moved = np.linalg.norm(slam.trajectory(after)[-1][:3, 3] - slam.trajectory(after)[-2][:3, 3])
+    assert moved < 0.02
+
+
+def garbage(frame: Frame) -> Frame:
+    """Depth that fits no surface, whatever the pose."""
+    noise = np.random.default_rng(0).uniform(0.3, 6, frame.depth.shape)
+    return following(frame)._replace(depth=noise.astype(np.float32))
+
+
+def test_nothing_is_learned_from_a_lost_frame(finished, frames):
+    after = slam.step(finished, garbage(frames[-1]), CFG)
+    record = after.records[-1]
+    assert record.status is Status.LOST and record.info.searched and after.trouble == 1
+    assert same_map(after, finished)
+    assert np.isfinite(slam.trajectory(after)).all()
+
+
+def test_tracking_goes_on_after_a_lost_frame(finished, frames):
+    lost = slam.step(finished, garbage(frames[-1]), CFG)
+    after = slam.step(lost, following(frames[-1])._replace(timestamp=frames[-1].timestamp + 2 / 30), CFG)
+    assert after.records[-1].status is Status.OK and after.trouble == 0
+
+
+def test_states_are_values(finished, frames):
+    """A step returns a new state and leaves the one it was given as it was."""
+    before = slam.trajectory(finished)
+    slam.step(finished, following(frames[-1]), CFG)
+    np.testing.assert_array_equal(slam.trajectory(finished), before)
+    assert len(finished.records) == FRAMES
