@@ -1,4 +1,4 @@
-"""Shared by all tests: strict JAX, a compilation cache, fixed hypothesis draws, and real sequences if present."""
+"""Shared by all tests: strict JAX, a compilation cache, fixed hypothesis draws, real sequences."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ settings.load_profile("fixed")
 # A shape that broadcasts by accident is the commonest silent error in array code.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Two processes that write the same entry at once leave one of them a half-written file; JAX then compiles anew,
-# with a warning that must not fail a test.
+# Two processes that write the same entry at once may read a half-written one; JAX then compiles anew, with a
+# warning that must not fail a test.
 CACHE_WARNING = "ignore:Error (reading|writing) persistent compilation cache entry"
 
 

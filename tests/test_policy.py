@@ -17,7 +17,13 @@ CFG = Config(
 )
 # An ordinary frame: all known, near the last keyframe, hardly moved
 PLAIN = FrameStats(
-    finite=True, known=0.9, since_keyframe=5, translation=0.05, rotation=0.02, step_translation=0.0, step_rotation=0.0
+    finite=True,
+    known=0.9,
+    since_keyframe=5,
+    translation=0.05,
+    rotation=0.02,
+    step_translation=0.0,
+    step_rotation=0.0,
 )
 
 
@@ -75,13 +81,17 @@ def test_a_weak_frame_is_mapped():
 
 
 def test_the_papers_spacing_of_keyframes():
-    cfg = replace(CFG, keyframe=replace(CFG.keyframe, every_frames=30, translation=float("inf"), rotation=float("inf")))
+    cfg = replace(
+        CFG, keyframe=replace(CFG.keyframe, every_frames=30, translation=float("inf"), rotation=float("inf"))
+    )
     far = PLAIN._replace(known=0.62, translation=5.0, rotation=3.0)
     assert not decide(far._replace(since_keyframe=29), cfg).keyframe
     assert decide(far._replace(since_keyframe=30), cfg).keyframe
     assert not decide(far._replace(since_keyframe=30, known=0.7), cfg).keyframe
 
 
-@pytest.mark.parametrize(("trouble", "factor"), [(0, 1.0), (1, 1.5), (2, 2.25), (3, 3.0), (100, 3.0), (10_000, 3.0)])
+@pytest.mark.parametrize(
+    ("trouble", "factor"), [(0, 1.0), (1, 1.5), (2, 2.25), (3, 3.0), (100, 3.0), (10_000, 3.0)]
+)
 def test_the_search_widens_with_trouble_up_to_a_limit(trouble, factor):
     assert widening(trouble, CFG) == pytest.approx(factor)

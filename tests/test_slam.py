@@ -1,4 +1,4 @@
-"""The host loop on a small synthetic sequence: what is compiled, what repeats, and what a bad frame may not touch."""
+"""The host loop on a small synthetic sequence: compilations, repetition, what bad frames may not touch."""
 
 from __future__ import annotations
 

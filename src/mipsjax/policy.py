@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from math import log
 from typing import NamedTuple
 
 from mipsjax.config import Config
@@ -56,7 +57,9 @@ def decide(stats: FrameStats, cfg: Config) -> Decision:
 
 def widening(trouble: int, cfg: Config) -> float:
     """Factor on the radii of the search after `trouble` weak or lost frames in a row."""
-    return min(cfg.track.ro.widening**trouble, cfg.track.ro.widening_limit)
+    factor, limit = cfg.track.ro.widening, cfg.track.ro.widening_limit
+    # By logarithms: the power itself would overflow over a long blind stretch.
+    return limit if trouble * log(factor) >= log(limit) else factor**trouble
 
 
 def _status(stats: FrameStats, cfg: Config) -> Status:

@@ -85,4 +85,6 @@ def see(T_world_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def apart(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
     """Metres and degrees between two poses."""
     turn = Rotation.from_matrix(np.asarray(T_a, np.float64)[:3, :3].T @ np.asarray(T_b, np.float64)[:3, :3])
-    return float(np.linalg.norm(np.asarray(T_a)[:3, 3] - np.asarray(T_b)[:3, 3])), float(np.rad2deg(turn.magnitude()))
+    return float(np.linalg.norm(np.asarray(T_a)[:3, 3] - np.asarray(T_b)[:3, 3])), float(
+        np.rad2deg(turn.magnitude())
+    )

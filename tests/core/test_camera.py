@@ -1,4 +1,4 @@
-"""The camera against coordinate images: what a pixel sees must not change when the image is resized or cut."""
+"""The camera: what a pixel sees must not change when the image is resized or cut."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def test_decimation_is_slicing(every_px):
 
 
 @given(
-    u=st.integers(0, CAMERA.width - 1), v=st.integers(0, CAMERA.height - 1), depth=st.floats(0.125, 8.0, width=32)
+    u=st.integers(0, CAMERA.width - 1),
+    v=st.integers(0, CAMERA.height - 1),
+    depth=st.floats(0.125, 8.0, width=32),
 )
 def test_projection_undoes_unprojection(u, v, depth):
     point = rays(jnp.array([v]), jnp.array([u]), CAMERA) * depth
@@ -77,7 +79,9 @@ def test_transform_against_homogeneous_coordinates():
     np.testing.assert_allclose(transform(jnp.array(T), jnp.array(points)), expected, atol=2e-6)
 
 
-@pytest.mark.parametrize(("rows", "columns", "height", "width"), [(3, 5, 12, 20), (4, 6, 15, 23), (16, 24, 48, 64)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "height", "width"), [(3, 5, 12, 20), (4, 6, 15, 23), (16, 24, 48, 64)]
+)
 def test_the_grid_reaches_every_pixel_over_its_shifts(rows, columns, height, width):
     seen = np.zeros((height, width), bool)
     fraction = (np.arange(8) + 0.5) / 8  # finer than a pixel in every cell above

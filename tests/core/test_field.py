@@ -120,7 +120,9 @@ def test_every_submap_of_a_config_has_the_same_shapes_and_is_small(name):
     cfg = PRESETS[name].field
     one, other = (jax.eval_shape(lambda k: nf.init(k, cfg), jax.random.key(s)) for s in (0, 1))
     assert jax.tree.structure(one) == jax.tree.structure(other)
-    assert [(a.shape, a.dtype) for a in jax.tree.leaves(one)] == [(a.shape, a.dtype) for a in jax.tree.leaves(other)]
+    assert [(a.shape, a.dtype) for a in jax.tree.leaves(one)] == [
+        (a.shape, a.dtype) for a in jax.tree.leaves(other)
+    ]
     size = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(one))
     assert size < (1e6 if cfg.encoding == "frequency" else 4e6)
 
@@ -139,7 +141,9 @@ def test_sinusoids_against_double_precision():
         angle = 2**octave * POINTS.astype(np.float64) * (2 * np.pi / SMALL.longest_wavelength)
         got = encoded[:, 3 + 6 * octave : 9 + 6 * octave]
         # sin 2a = 2 sin a cos a and cos 2a = 1 - 2 sin^2 a make an error at most four times as large
-        np.testing.assert_allclose(got, np.concatenate([np.sin(angle), np.cos(angle)], 1), atol=4**octave * 3e-7)
+        np.testing.assert_allclose(
+            got, np.concatenate([np.sin(angle), np.cos(angle)], 1), atol=4**octave * 3e-7
+        )
 
 
 # The spatial hash of Teschner et al. 2003 with the constants of Mueller et al. 2022, in plain Python integers
@@ -180,7 +184,9 @@ def test_hash_features_against_plain_python():
         np.testing.assert_allclose(np.sort(row), np.sort(np.ravel(expected)), atol=5e-5)
 
 
-ONE_LEVEL = replace(SMALL, hash_levels=1, hash_coarsest=0.25, hash_finest=0.25)  # a power of two: exact in float32
+ONE_LEVEL = replace(
+    SMALL, hash_levels=1, hash_coarsest=0.25, hash_finest=0.25
+)  # a power of two: exact in float32
 
 
 def test_a_corner_of_a_cell_has_the_features_of_its_entry():
@@ -211,7 +217,9 @@ def test_the_gradient_of_hash_features_is_numerical():
     for axis in range(3):
         shift = np.zeros(3, np.float32)
         shift[axis] = step
-        rise = nf.hash_features(table, points + shift, ONE_LEVEL) - nf.hash_features(table, points - shift, ONE_LEVEL)
+        rise = nf.hash_features(table, points + shift, ONE_LEVEL) - nf.hash_features(
+            table, points - shift, ONE_LEVEL
+        )
         # Linear along each axis within a cell, so that only rounding separates the two: 1e-6 over 0.02
         np.testing.assert_allclose(gradient[:, axis], rise.sum(1) / (2 * step), atol=2e-3)
 

@@ -22,7 +22,8 @@ TOLERANCE = {"rtol": 1e-5, "atol": 1e-8}
 
 @pytest.fixture(scope="module")
 def draws():
-    """Predictions, targets and masks with the same number of samples on every ray, as the paper's means assume."""
+    """Predictions, targets and masks. Every ray has as many samples as the others: the paper's mean over rays
+    of means over samples is then the mean over all samples that the code takes."""
     rng = np.random.default_rng(0)
     near = np.zeros((RAYS, SAMPLES), bool)
     near[:, 3:] = True
@@ -138,8 +139,12 @@ def test_rendered_color_and_depth(draws):
     color, depth = losses.render(weights, draws["values"]), losses.render(weights, draws["depth"])
     w = np.asarray(weights, np.float64)
     for p in range(RAYS):
-        np.testing.assert_allclose(color[p], sum(w[p, s] * draws["values"][p, s] for s in range(SAMPLES)), **TOLERANCE)
-        np.testing.assert_allclose(depth[p], sum(w[p, s] * draws["depth"][p, s] for s in range(SAMPLES)), **TOLERANCE)
+        np.testing.assert_allclose(
+            color[p], sum(w[p, s] * draws["values"][p, s] for s in range(SAMPLES)), **TOLERANCE
+        )
+        np.testing.assert_allclose(
+            depth[p], sum(w[p, s] * draws["depth"][p, s] for s in range(SAMPLES)), **TOLERANCE
+        )
 
 
 def test_rays_without_a_sample_near_the_surface_have_no_weight():
@@ -148,7 +153,11 @@ def test_rays_without_a_sample_near_the_surface_have_no_weight():
 
 
 def test_rgb(draws):
-    rendered, measured, mask = draws["values"][:, 0], draws["values"][:, 1], np.array([1, 0, 1, 1, 0, 1], bool)
+    rendered, measured, mask = (
+        draws["values"][:, 0],
+        draws["values"][:, 1],
+        np.array([1, 0, 1, 1, 0, 1], bool),
+    )
     expected = np.mean([np.linalg.norm(rendered[p] - measured[p]) for p in range(RAYS) if mask[p]])
     np.testing.assert_allclose(losses.rgb(rendered, measured, mask), expected, **TOLERANCE)
 

@@ -21,7 +21,9 @@ def refine(submap, frames, steps, key=KEY):
 
 
 def same_bits(a, b) -> bool:
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))
+    return all(
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True)
+    )
 
 
 @pytest.fixture(scope="module")

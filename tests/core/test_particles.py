@@ -19,15 +19,17 @@ from mipsjax.core import particles
 from mipsjax.core.particles import Swarm
 
 COUNT, PIXELS = 256, 40
-FIELD = FieldConfig(encoding="frequency", octaves=1, hidden=(), color_hidden=(), coldness=1.0, normalised=False)
+FIELD = FieldConfig(
+    encoding="frequency", octaves=1, hidden=(), color_hidden=(), coldness=1.0, normalised=False
+)
 SEARCH = SearchConfig(particles=COUNT, pixels=PIXELS, uncertainty=True)
 RADII = np.array([0.05, 0.05, 0.05, 0.1, 0.1, 0.1], np.float32)
 
 
 @pytest.fixture(scope="module")
 def wall() -> nf.Field:
-    """The distance to the plane z = 0, a monotone function of z: without hidden layers the encoding's first three
-    numbers, the point itself, go straight into the classes."""
+    """The distance to the plane z = 0 as a monotone function of z: without hidden layers the first three
+    numbers of the encoding, the point itself, go straight into the classes."""
     field = nf.init(jax.random.key(0), FIELD)
     labels = np.linspace(-1, 1, FIELD.classes)
     weight = np.zeros(field.smooth.weights[0].shape, np.float32)
@@ -56,7 +58,11 @@ def fitness(plane_points):
 
 @pytest.fixture(scope="module")
 def step(plane_points):
-    return jax.jit(lambda swarm, template, field: particles.step(swarm, template, field, plane_points, MASK, FIELD, SEARCH))
+    return jax.jit(
+        lambda swarm, template, field: particles.step(
+            swarm, template, field, plane_points, MASK, FIELD, SEARCH
+        )
+    )
 
 
 def test_the_template_is_uniform_in_the_unit_ball():
@@ -122,7 +128,7 @@ def test_fitness_does_not_depend_on_the_other_poses(wall, plane_points):
     """However many there are, and so however they fall into chunks."""
     poses = poses_around(TRUTH, 700)
     costs = particles.fitness(wall, poses, plane_points, MASK, FIELD, SEARCH)
-    for count in (1, 3, 201, 410):
+    for count in (1, 410):
         part = particles.fitness(wall, poses[-count:], plane_points, MASK, FIELD, SEARCH)
         np.testing.assert_allclose(part, costs[-count:], rtol=1e-5, atol=1e-13)
 
@@ -136,7 +142,9 @@ def off_by(delta) -> np.ndarray:
     return TRUTH @ np.asarray(particles.delta_pose(np.array(delta, np.float32)))
 
 
-@pytest.mark.parametrize("delta", [(0, 0, 0, 0, 0, 0.05), (0.03, 0, 0, 0, 0, 0), (0.02, -0.02, 0, 0, 0, -0.06), (0,) * 6])
+@pytest.mark.parametrize(
+    "delta", [(0, 0, 0, 0, 0, 0.05), (0.03, 0, 0, 0, 0, 0), (0.02, -0.02, 0, 0, 0, -0.06), (0,) * 6]
+)
 def test_a_step_never_worsens_the_centre(wall, fitness, step, delta):
     swarm = Swarm(off_by(delta), jnp.float32(jnp.inf), jnp.asarray(RADII))
     costs = [float(fitness(wall, swarm.T_sub_cam[None])[0])]

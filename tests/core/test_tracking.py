@@ -45,7 +45,12 @@ def points(frame) -> tracking.Points:
 def lm(corner_map, points):
     """Levenberg-Marquardt alone, from a stack of starts."""
     one = partial(
-        tracking.levenberg_marquardt, corner_map.field, points=points, part="whole", steps=CFG.track.go.steps, cfg=CFG
+        tracking.levenberg_marquardt,
+        corner_map.field,
+        points=points,
+        part="whole",
+        steps=CFG.track.go.steps,
+        cfg=CFG,
     )
     run = jax.jit(jax.vmap(lambda T: one(T)))
     return lambda starts: np.asarray(run(np.stack(starts).astype(np.float32)))
@@ -82,11 +87,15 @@ def test_the_jacobian_of_the_distance_by_a_twist(corner_map, points):
     T, p, step = jnp.asarray(TRUTH, jnp.float32), points.p_cam[:200], 1e-3
 
     def psi(xi):
-        return nf.tsdf(corner_map.field, transform(T @ jaxlie.SE3.exp(xi).as_matrix(), p), CFG.field, "search").psi
+        return nf.tsdf(
+            corner_map.field, transform(T @ jaxlie.SE3.exp(xi).as_matrix(), p), CFG.field, "search"
+        ).psi
 
     @jax.jit
     def both():
-        gradient = jax.grad(lambda q: jnp.sum(nf.tsdf(corner_map.field, q, CFG.field, "search").psi))(transform(T, p))
+        gradient = jax.grad(lambda q: jnp.sum(nf.tsdf(corner_map.field, q, CFG.field, "search").psi))(
+            transform(T, p)
+        )
         local = gradient @ T[:3, :3]
         twists = step * jnp.eye(6)
         numerical = jnp.stack([(psi(xi) - psi(-xi)) / (2 * step) for xi in twists], -1)
@@ -140,7 +149,7 @@ def test_the_search_recovers_what_lm_alone_does_not(corner_map, frame, lm, offse
 
 
 def test_adam_converges_from_a_small_offset(corner_map, points):
-    """The paper's optimiser on d2t and colour. Its step is 1 cm and 0.57 degrees: it ends near, not at, the truth."""
+    """The paper's optimiser on d2t and colour; with steps of 1 cm and 0.57 degrees it ends near the truth."""
     start = TRUTH @ pose((0.5, -0.5, 0.3), (0.01, -0.005, 0.01))
     run = jax.jit(partial(tracking.adam, corner_map.field, points=points, key=KEY, cfg=ADAM))
     T = np.asarray(run(start.astype(np.float32)))

@@ -37,6 +37,7 @@ class Field(NamedTuple):
     fine: Net | None
     """Distance from a hash grid."""
     color: Net
+    """Colour from the features of the hash grid, or from sinusoids where there is none."""
 
 
 class Tsdf(NamedTuple):
@@ -64,11 +65,8 @@ def init(key: PRNGKeyArray, cfg: FieldConfig) -> Field:
         smooth = _init_net(k_smooth, (_frequency_width(cfg), *cfg.hidden, outputs))
     if cfg.encoding in ("hash", "both"):
         fine = _init_net(k_fine, (_hash_width(cfg), *cfg.hash_hidden, outputs), cfg)
-    if cfg.encoding == "frequency":
-        color = _init_net(k_color, (_frequency_width(cfg), *cfg.color_hidden, 3))
-    else:
-        color = _init_net(k_color, (_hash_width(cfg), *cfg.color_hidden, 3), cfg)
-    return Field(smooth, fine, color)
+    width = _frequency_width(cfg) if fine is None else _hash_width(cfg)
+    return Field(smooth, fine, _init_net(k_color, (width, *cfg.color_hidden, 3)))
 
 
 def tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig, part: Part = "whole") -> Tsdf:
@@ -83,22 +81,43 @@ def tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig, part: Part
 def smooth_tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Tsdf:
     """Distance from the sinusoidal field."""
     assert field.smooth is not None
-    return _classify(_mlp(field.smooth, frequencies(points, cfg)), cfg)
+    return classify(field.smooth, frequencies(points, cfg), cfg)
 
 
 def fine_tsdf(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Tsdf:
     """Distance from the hash-grid field."""
-    assert field.fine is not None and field.fine.table is not None
-    return _classify(_mlp(field.fine, hash_features(field.fine.table, points, cfg)), cfg)
+    assert field.fine is not None
+    return classify(field.fine, encode(field, points, cfg), cfg)
 
 
 def color(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N 3"]:
     """RGB in 0..1."""
-    if field.color.table is None:
-        encoded = frequencies(points, cfg)
-    else:
-        encoded = hash_features(field.color.table, points, cfg)
+    return decode_color(field, encode(field, points, cfg))
+
+
+def encode(field: Field, points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N E"]:
+    """What the finest distance and the colour are read from, to be computed once for both."""
+    if field.fine is None:
+        return frequencies(points, cfg)
+    assert field.fine.table is not None
+    return hash_features(field.fine.table, points, cfg)
+
+
+def decode_color(field: Field, encoded: Float[Array, "N E"]) -> Float[Array, "N 3"]:
+    """RGB in 0..1 from `encode`."""
     return jax.nn.sigmoid(_mlp(field.color, encoded))
+
+
+def classify(net: Net, encoded: Float[Array, "N E"], cfg: FieldConfig) -> Tsdf:
+    """Distance and uncertainty from encoded points (Eq. 2 and the entropy below it)."""
+    z = _mlp(net, encoded)
+    if not cfg.classification:
+        psi = cfg.truncation * jnp.tanh(z[:, 0])
+        return Tsdf(psi, jnp.ones_like(psi), psi[:, None])
+    z = jax.nn.softmax(z) if cfg.normalised else z
+    log_p = jax.nn.log_softmax(cfg.coldness * z)
+    p = jnp.exp(log_p)
+    return Tsdf(p @ class_values(cfg), -jnp.sum(p * log_p, -1), log_p)
 
 
 def frequencies(points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N E"]:
@@ -125,7 +144,7 @@ def hash_features(
     interpolation, which is an order of magnitude faster on a CPU than gathering rows and summing.
     """
     levels, entries, features = table.shape
-    cells = points.T[:, None] / np.array(_cells(cfg), np.float32)[:, None]
+    cells = points.T[:, None] / np.array(_cells(cfg), np.float32)[None, :, None]
     base = jnp.floor(cells)
     offset = cells - base
     lo = base.astype(jnp.int32).astype(jnp.uint32) * HASH_PRIMES[:, None, None]
@@ -143,7 +162,7 @@ def _trilinear(corners: Float[Array, "8 L N"], offset: Float[Array, "3 L N"]) ->
     """Corners in the order 000, 001, 010, ... of (x, y, z)."""
     for axis in range(3):
         half = corners.shape[0] // 2
-        corners = corners[:half] + (corners[half:] - corners[:half]) * offset[axis]
+        corners = corners[:half] + (corners[half:] - corners[:half]) * offset[axis][None]
     return corners[0]
 
 
@@ -175,15 +194,5 @@ def _init_net(key: PRNGKeyArray, widths: tuple[int, ...], hashed: FieldConfig | 
 
 def _mlp(net: Net, x: Float[Array, "N I"]) -> Float[Array, "N O"]:
     for w, b in zip(net.weights[:-1], net.biases[:-1], strict=True):
-        x = jax.nn.relu(x @ w + b)
-    return x @ net.weights[-1] + net.biases[-1]
-
-
-def _classify(z: Float[Array, "N C"], cfg: FieldConfig) -> Tsdf:
-    if not cfg.classification:
-        psi = cfg.truncation * jnp.tanh(z[:, 0])
-        return Tsdf(psi, jnp.ones_like(psi), psi[:, None])
-    z = jax.nn.softmax(z) if cfg.normalised else z
-    log_p = jax.nn.log_softmax(cfg.coldness * z)
-    p = jnp.exp(log_p)
-    return Tsdf(p @ class_values(cfg), -jnp.sum(p * log_p, -1), log_p)
+        x = jax.nn.relu(x @ w + b[None])
+    return x @ net.weights[-1] + net.biases[-1][None]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
@@ -136,19 +137,17 @@ def map_loss(
     samples = sampling.label(depth, flat.depth, flat.slope, tau)
     points = at(depth)
     total = jnp.zeros(())
-    psi = None
     if field.smooth is not None:
-        prediction = nf.smooth_tsdf(field, points, cfg.field)
-        total += tsdf_loss(prediction, samples, cfg)
-        psi = prediction.psi
-    if field.fine is not None:
+        total += tsdf_loss(nf.smooth_tsdf(field, points, cfg.field), samples, cfg)
         # Where there is a smooth field, it alone moves the poses: derivatives through the hash grid cost more
         # than the rest of the step.
-        fine_points = points if field.smooth is None else jax.lax.stop_gradient(points)
-        prediction = nf.fine_tsdf(field, fine_points, cfg.field)
+        points = jax.lax.stop_gradient(points)
+    encoded = nf.encode(field, points, cfg.field)
+    net = field.smooth if field.fine is None else field.fine
+    prediction = nf.classify(net, encoded, cfg.field)
+    if field.fine is not None:
         total += tsdf_loss(prediction, samples, cfg)
-        psi = prediction.psi
-    return total + cfg.loss.rgb * color_loss(field, psi, samples, flat, at, cfg)
+    return total + cfg.loss.rgb * color_loss(field, prediction.psi, encoded, samples, flat, cfg)
 
 
 def tsdf_loss(prediction: nf.Tsdf, samples: sampling.Samples, cfg: Config) -> Float[Array, ""]:
@@ -162,13 +161,30 @@ def tsdf_loss(prediction: nf.Tsdf, samples: sampling.Samples, cfg: Config) -> Fl
     return total
 
 
-def color_loss(field, psi, samples, pixels, at, cfg) -> Float[Array, ""]:
-    n = cfg.loss.color_samples
-    near = samples.near[:, -n:]
-    psi = jax.lax.stop_gradient(psi.reshape(samples.depth.shape)[:, -n:])
-    weights = losses.render_weights(psi, near, cfg.field.truncation)
-    rgb = nf.color(field, jax.lax.stop_gradient(at(samples.depth[:, -n:])), cfg.field).reshape(*near.shape, 3)
+def color_loss(
+    field: nf.Field,
+    psi: Float[Array, " N"],
+    encoded: Float[Array, "N E"],
+    samples: sampling.Samples,
+    pixels: Pixels,
+    cfg: Config,
+) -> Float[Array, ""]:
+    """Colour rendered on some samples of each ray, spread over the truncation region (Eqs. 5 and 14)."""
+    rays, count = samples.depth.shape
+    some = _color_samples(count, cfg)
+    psi = jax.lax.stop_gradient(psi).reshape(rays, count)[:, some]
+    weights = losses.render_weights(psi, samples.near[:, some], cfg.field.truncation)
+    picked = encoded.reshape(rays, count, -1)[:, some]
+    rgb = nf.decode_color(field, picked.reshape(-1, picked.shape[-1])).reshape(*weights.shape, 3)
     return losses.rgb(losses.render(weights, rgb), pixels.color, pixels.depth > 0)
+
+
+def _color_samples(count: int, cfg: Config) -> np.ndarray:
+    """Which of the samples carry colour: those drawn in the truncation region lie behind the uniform ones."""
+    if cfg.loss.color_samples >= count:
+        return np.arange(count)
+    first = cfg.sample.uniform
+    return np.unique(np.linspace(first, first + cfg.sample.truncation - 1, cfg.loss.color_samples).round().astype(int))
 
 
 def draw_pixels(

@@ -66,7 +66,7 @@ def pose_cost(
     search: SearchConfig,
 ) -> Float[Array, ""]:
     """Uncertainty-weighted depth-to-TSDF cost of one pose (Eq. 11), as a weighted mean: square metres."""
-    p_sub = p_cam @ T_sub_cam[:3, :3].T + T_sub_cam[:3, 3]
+    p_sub = p_cam @ T_sub_cam[:3, :3].T + T_sub_cam[None, :3, 3]
     prediction = nf.tsdf(field, p_sub, cfg, "search")
     weight = mask.astype(jnp.float32)
     if search.uncertainty:
@@ -98,10 +98,11 @@ def step(
     search: SearchConfig,
 ) -> Swarm:
     """One iteration: advantage set, move, rescale (Eqs. 12 to 14)."""
-    deltas = particles * swarm.radii
+    deltas = particles * swarm.radii[None]
     costs = fitness(field, swarm.T_sub_cam @ delta_pose(deltas), p_cam, mask, cfg, search)
+    costs = jnp.nan_to_num(costs, nan=jnp.inf)
     # Particle 0 is the centre itself, on this step's pixels.
-    gain = jnp.maximum(costs[0] - costs, 0)
+    gain = jnp.nan_to_num(jnp.maximum(costs[0] - costs, 0), posinf=0.0)
     total = jnp.sum(gain)
     mean = jnp.sum(gain[:, None] * deltas, 0) / jnp.maximum(total, 1e-20)
     best = deltas[jnp.argmin(costs)]

@@ -94,7 +94,7 @@ def levenberg_marquardt(
         gradient = pull(jnp.ones_like(psi))[0] @ T[:3, :3]
         jacobian = jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
         weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
-        weighted = jacobian.T * weight
+        weighted = jacobian.T * weight[None]
         return jnp.sum(robust_cost(psi, scale) * points.mask), weighted @ jacobian, weighted @ psi
 
     def step(carry, _):
