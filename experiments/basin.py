@@ -38,7 +38,7 @@ def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Submap, list[np.nda
     for number in range(STEPS // cfg.map.steps):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
         submap, _, _ = slam._refine(
-            submap, batch, [False] * cfg.map.frames, cfg.map.steps, number, sequence.intrinsics, cfg
+            submap, batch, [0.0] * cfg.map.frames, cfg.map.steps, number, sequence.intrinsics, cfg
         )
     return submap, list(truth)
 

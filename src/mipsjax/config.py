@@ -74,7 +74,7 @@ class SampleConfig:
     """Around the sample with the smallest distance, in a second phase."""
     surface_spread: float = 0.05
     """Metres, half length of that second interval; the paper gives none."""
-    perpendicular: bool = False
+    perpendicular: bool = True
     """Targets are distances across the surface, by the normal of the depth image, not along the ray."""
 
 
@@ -98,9 +98,9 @@ class LossConfig:
 class MapConfig:
     """Local bundle adjustment."""
 
-    steps: int = 8
-    """Each frame, once a submap is initialised (paper: 15 in one place, 10 in another)."""
-    steps_slow: int = 8
+    steps: int = 16
+    """Each frame of a fast camera, once a submap is initialised (paper: 15 in one place, 10 in another, always)."""
+    steps_slow: int = 6
     """The same where the camera has hardly moved since the last frame; in between, in proportion to the motion."""
     motion: float = 0.1
     """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""
@@ -112,6 +112,10 @@ class MapConfig:
     """Of each frame in each step (paper: 384)."""
     learning_rate: float = 1e-2
     pose_learning_rate: float = 1e-3
+    """Of the twist of each frame, metres and radians."""
+    pose_rate_slow: float = 0.1
+    """Share of that rate where the camera has hardly moved: Adam's first steps are as long as its rate however
+    small the gradient, and would shake poses that are known to a millimetre. 1 is the paper."""
     width_px: int = 160
     """Images are decimated to about this width for mapping; it bounds the memory of a keyframe."""
 
@@ -243,9 +247,9 @@ def preset(name: str) -> Config:
 
 PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
-    sample=SampleConfig(uniform=20, truncation=20, surface=10),
+    sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     loss=LossConfig(cross_entropy=0.0, color_samples=50),
-    map=MapConfig(steps=15, steps_slow=15, first_steps=500, pixels=384, learning_rate=1e-2),
+    map=MapConfig(steps=15, steps_slow=15, pose_rate_slow=1.0, first_steps=500, pixels=384, learning_rate=1e-2),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10),

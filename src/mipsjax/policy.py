@@ -45,14 +45,22 @@ class Decision(NamedTuple):
     status: Status
     keyframe: bool
     map_steps: int
+    pose_rate: float
+    """Share of the pose learning rate in local bundle adjustment."""
 
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
     status = _status(stats, cfg)
     if status is Status.LOST:
-        return Decision(status, keyframe=False, map_steps=0)
-    return Decision(status, _is_keyframe(stats, cfg), _map_steps(stats, cfg))
+        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0)
+    share = _motion_share(stats, cfg)
+    return Decision(
+        status,
+        keyframe=_is_keyframe(stats, cfg),
+        map_steps=round(_between(cfg.map.steps_slow, cfg.map.steps, share)),
+        pose_rate=_between(cfg.map.pose_rate_slow, 1.0, share),
+    )
 
 
 def widening(trouble: int, cfg: Config) -> float:
@@ -75,6 +83,10 @@ def _is_keyframe(stats: FrameStats, cfg: Config) -> bool:
     return moved or stats.known < cfg.keyframe.known
 
 
-def _map_steps(stats: FrameStats, cfg: Config) -> int:
-    share = min(1.0, max(stats.step_translation, stats.step_rotation) / cfg.map.motion)
-    return round(cfg.map.steps_slow + share * (cfg.map.steps - cfg.map.steps_slow))
+def _motion_share(stats: FrameStats, cfg: Config) -> float:
+    """How fast the camera moves, 0 for a still one to 1 for one that deserves all effort."""
+    return min(1.0, max(stats.step_translation, stats.step_rotation) / cfg.map.motion)
+
+
+def _between(slow: float, fast: float, share: float) -> float:
+    return slow + share * (fast - slow)

@@ -88,7 +88,7 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     began = perf_counter()
     submap = mapping.create(_key(cfg, INIT, 0), cfg)
     keyframe = _keyframe(frame, 0, np.eye(4), cfg, camera)
-    submap, _, ok = _refine(submap, [keyframe] * cfg.map.frames, [False] * cfg.map.frames, cfg.map.first_steps, 0, camera, cfg)
+    submap, _, ok = _refine(submap, [keyframe] * cfg.map.frames, [0.0] * cfg.map.frames, cfg.map.first_steps, 0, camera, cfg)
     info = FrameInfo(keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite")
     record = Record(frame.index, frame.timestamp, 0, np.eye(4), Status.OK, info)
     return SlamState(submap, (keyframe,), (record,), np.eye(4) if T_world_sub is None else T_world_sub, camera, 0)
@@ -141,7 +141,8 @@ def _learn(
         current = _keyframe(frame, number, T_sub_cam, cfg, state.camera)
         chosen = _choose(len(keyframes), number, cfg)
         batch = [current, *(keyframes[i] for i in chosen)]
-        submap, poses, ok = _refine(submap, batch, [i != 0 for i in (-1, *chosen)], decision.map_steps, number, state.camera, cfg)
+        rates = [decision.pose_rate if i != 0 else 0.0 for i in (-1, *chosen)]
+        submap, poses, ok = _refine(submap, batch, rates, decision.map_steps, number, state.camera, cfg)
         T_sub_cam = poses[0]
         for i, pose in zip(chosen, poses[1:], strict=True):
             keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
@@ -176,17 +177,17 @@ def _coast(
 
 
 def _refine(
-    submap: mapping.Submap, batch: list[Keyframe], movable: list[bool], steps: int, number: int, camera: Intrinsics, cfg: Config
+    submap: mapping.Submap, batch: list[Keyframe], rates: list[float], steps: int, number: int, camera: Intrinsics, cfg: Config
 ) -> tuple[mapping.Submap, list[Pose], bool]:
     frames = mapping.Frames(
         depth=np.stack([k.depth for k in batch]),
         color=np.stack([k.color for k in batch]),
         T_sub_cam=np.stack([k.T_sub_cam for k in batch]).astype(np.float32),
-        movable=np.array(movable),
+        movable=np.array(rates, np.float32),
     )
     small = camera.decimated(mapping_stride(camera, cfg))
     submap, poses, info = mapping.refine(submap, frames, jnp.int32(steps), _key(cfg, MAP, number), small, cfg)
-    moved = [_rigid(pose) if m else k.T_sub_cam for pose, m, k in zip(np.asarray(poses), movable, batch, strict=True)]
+    moved = [_rigid(pose) if rate else k.T_sub_cam for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)]
     return submap, moved, bool(info.ok)
 
 

@@ -35,8 +35,8 @@ class Frames(NamedTuple):
     """Metres, 0 for no measurement."""
     color: UInt8[Array, "F H W 3"]
     T_sub_cam: Float[Array, "F 4 4"]
-    movable: Bool[Array, " F"]
-    """Whether the pose is optimised; the anchor's is not."""
+    movable: Float[Array, " F"]
+    """Share of the pose learning rate at which the pose is optimised; 0 for the anchor's."""
 
 
 class Pixels(NamedTuple):
@@ -97,7 +97,7 @@ def refine(
 
 
 def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
-    """Poses after a twist (v, omega) in each camera's own frame; those not movable stay."""
+    """Poses after a twist (v, omega) in each camera's own frame; those with movable 0 stay."""
     return perturb(frames.T_sub_cam, twist * frames.movable[:, None])
 
 
