@@ -43,6 +43,7 @@ def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -
             began = time.perf_counter()
         state = slam.step(state, sequence[position], cfg)
     seconds = time.perf_counter() - began
+    state = slam.finish(state, cfg)
     row = {"sequence": Path(path).name, "frames": len(sequence), "stride": frames.step or 1, "seed": seed}
     return Run(state, sequence, row | figures(state, sequence, seconds))
 

@@ -106,6 +106,9 @@ class MapConfig:
     """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""
     first_steps: int = 200
     """On the anchor of a new submap (paper: 500)."""
+    final_steps: int = 600
+    """After the last frame, over all keyframes, with a falling learning rate; 0 is none, as in the paper, whose
+    background thread has refined each submap many times over by then."""
     frames: int = 5
     """The current frame, the anchor, and randomly chosen keyframes."""
     pixels: int = 128
@@ -249,7 +252,7 @@ PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     loss=LossConfig(cross_entropy=0.0, color_samples=50),
-    map=MapConfig(steps=15, steps_slow=15, pose_rate_slow=1.0, first_steps=500, pixels=384, learning_rate=1e-2),
+    map=MapConfig(steps=15, steps_slow=15, pose_rate_slow=1.0, first_steps=500, final_steps=0, pixels=384, learning_rate=1e-2),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10),
@@ -259,7 +262,7 @@ PAPER = Config(
 TINY = Config(
     field=FieldConfig(hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)),
     sample=SampleConfig(uniform=4, truncation=6),
-    map=MapConfig(steps=4, steps_slow=4, first_steps=60, pixels=64),
+    map=MapConfig(steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
     track=TrackConfig(ro=SearchConfig(particles=128, pixels=48, steps=4), go=RefineConfig(pixels=192, steps=8, smooth_steps=4)),
     mesh=MeshConfig(voxel=0.05),
 )

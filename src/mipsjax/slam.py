@@ -23,7 +23,8 @@ from mipsjax.policy import Decision, FrameStats, Status, decide, widening
 Pose = Float64[np.ndarray, "4 4"]
 
 # Purposes of random draws: a draw added in one place moves no other.
-INIT, TRACK, MAP, CHOOSE = range(4)
+INIT, TRACK, MAP, CHOOSE, FINISH = range(5)
+FINISH_STEPS = 10  # of each batch in `finish`
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
@@ -108,6 +109,25 @@ def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
     return _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
 
 
+def finish(state: SlamState, cfg: Config) -> SlamState:
+    """Bundle adjustment over all keyframes after the last frame, at rates that fall to zero.
+
+    Each call of `mapping.refine` takes another random batch; the anchor is always fixed.
+    """
+    calls, keyframes, submap = -(-cfg.map.final_steps // FINISH_STEPS), list(state.keyframes), state.submap
+    for call in range(calls):
+        rng = np.random.default_rng((cfg.seed, FINISH, call))
+        fresh = len(keyframes) < cfg.map.frames
+        chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
+        fall = 1 - call / calls
+        rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
+        batch, number = [keyframes[i] for i in chosen], len(state.records) + call
+        submap, poses, _ = _refine(submap, batch, rates, FINISH_STEPS, number, state.camera, cfg, fall)
+        for i, pose in zip(chosen, poses, strict=True):
+            keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
+    return state._replace(submap=submap, keyframes=tuple(keyframes))
+
+
 def trajectory(state: SlamState) -> Float64[np.ndarray, "N 4 4"]:
     """World pose of every processed frame, camera-to-world."""
     return np.stack([state.T_world_sub @ _pose(state, record) for record in state.records])
@@ -177,7 +197,7 @@ def _coast(
 
 
 def _refine(
-    submap: mapping.Submap, batch: list[Keyframe], rates: list[float], steps: int, number: int, camera: Intrinsics, cfg: Config
+    submap: mapping.Submap, batch: list[Keyframe], rates: list[float], steps: int, number: int, camera: Intrinsics, cfg: Config, rate: float = 1.0
 ) -> tuple[mapping.Submap, list[Pose], bool]:
     frames = mapping.Frames(
         depth=np.stack([k.depth for k in batch]),
@@ -186,7 +206,7 @@ def _refine(
         movable=np.array(rates, np.float32),
     )
     small = camera.decimated(mapping_stride(camera, cfg))
-    submap, poses, info = mapping.refine(submap, frames, jnp.int32(steps), _key(cfg, MAP, number), small, cfg)
+    submap, poses, info = mapping.refine(submap, frames, jnp.int32(steps), _key(cfg, MAP, number), small, cfg, np.float32(rate))
     moved = [_rigid(pose) if rate else k.T_sub_cam for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)]
     return submap, moved, bool(info.ok)
 

@@ -70,10 +70,17 @@ def create(key: PRNGKeyArray, cfg: Config) -> Submap:
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
 def refine(
-    submap: Submap, frames: Frames, steps: Int[Array, ""], key: PRNGKeyArray, camera: Intrinsics, cfg: Config
+    submap: Submap,
+    frames: Frames,
+    steps: Int[Array, ""],
+    key: PRNGKeyArray,
+    camera: Intrinsics,
+    cfg: Config,
+    rate: Float[Array, ""] | float = 1.0,
 ) -> tuple[Submap, Float[Array, "F 4 4"], MapInfo]:
     """`steps` steps of Adam on map and poses (Section 3.4 of the paper).
 
+    `rate` is a share of the networks' learning rate.
     Returns the submap, the poses and an info; all as before where anything became infinite or NaN.
     """
     pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
@@ -86,7 +93,8 @@ def refine(
         loss, (g_field, g_twist) = loss_and_gradient(field, jnp.zeros_like(twist), poses, frames, k, camera, cfg)
         change, state = optimizer(cfg).update(g_field, state, field)
         pose_change, pose_state = pose_optimizer.update(g_twist, pose_state)
-        return optax.apply_updates(field, change), state, twist + pose_change, pose_state, loss
+        field = jax.tree.map(lambda p, c: p + rate * c, field, change)
+        return field, state, twist + pose_change, pose_state, loss
 
     twist = jnp.zeros((frames.depth.shape[0], 6))
     start = (submap.field, submap.optimizer, twist, pose_optimizer.init(twist), jnp.zeros(()))
