@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from common import changed, show, use_compilation_cache, write_rows
 
+from common import changed, show, use_compilation_cache, write_rows
 from mipsjax import slam
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking
@@ -49,14 +49,20 @@ def starts(count: int, frames: int, seed: int) -> list[tuple[int, np.ndarray]]:
     out = []
     for _ in range(count):
         v, w = (d / np.linalg.norm(d) for d in rng.standard_normal((2, 3)))
-        out.append((int(rng.integers(frames)), np.r_[v * rng.random() * OFFSET_M, w * rng.random() * OFFSET_RAD]))
+        out.append(
+            (int(rng.integers(frames)), np.r_[v * rng.random() * OFFSET_M, w * rng.random() * OFFSET_RAD])
+        )
     return out
 
 
-def share(submap: mapping.Submap, truth: list[np.ndarray], sequence: Sequence, cfg: Config, count: int) -> float:
+def share(
+    submap: mapping.Submap, truth: list[np.ndarray], sequence: Sequence, cfg: Config, count: int
+) -> float:
     done = 0
     for number, (frame, twist) in enumerate(starts(count, len(sequence), cfg.seed)):
-        start = truth[frame] @ np.asarray(jaxlie.SE3.exp(jnp.asarray(twist, jnp.float32)).as_matrix(), np.float64)
+        start = truth[frame] @ np.asarray(
+            jaxlie.SE3.exp(jnp.asarray(twist, jnp.float32)).as_matrix(), np.float64
+        )
         image = sequence[frame]
         T, _ = tracking.track(
             submap.field,
@@ -74,7 +80,9 @@ def share(submap: mapping.Submap, truth: list[np.ndarray], sequence: Sequence, c
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--encodings", nargs="*", default=["both"])
     options = parser.parse_args()

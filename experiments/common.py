@@ -89,7 +89,9 @@ def write_rows(name: str, rows: Iterable[Mapping[str, Any]]) -> Path:
     OUT.mkdir(exist_ok=True)
     path = OUT / f"{name}.csv"
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
+        writer = csv.DictWriter(
+            file, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n"
+        )
         writer.writeheader()
         writer.writerows(rows)
     return path
@@ -97,7 +99,9 @@ def write_rows(name: str, rows: Iterable[Mapping[str, Any]]) -> Path:
 
 def show(row: Mapping[str, Any]) -> None:
     """One line a run, at once, so that a long experiment can be watched."""
-    print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
+    print(
+        "  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True
+    )
 
 
 def use_compilation_cache() -> None:

@@ -41,7 +41,7 @@ def run() -> Run:
         slam.FrameInfo(),
     ]
     records = tuple(
-        slam.Record(frame.index, frame.timestamp, 0, np.eye(4), status, info)
+        slam.Record(frame.number, frame.timestamp, 0, np.eye(4), status, info)
         for frame, info, status in zip(frames[1:], infos, (Status.OK, Status.SKIPPED, Status.OK), strict=True)
     )
     submap = mapping.create(jax.random.key(0), CFG)

@@ -49,7 +49,7 @@ def same_map(a: slam.SlamState, b: slam.SlamState) -> bool:
 
 def test_frames_are_tracked(finished, sequence):
     assert len(finished.records) == FRAMES
-    assert [r.index for r in finished.records] == list(range(FRAMES))
+    assert [r.frame for r in finished.records] == list(range(FRAMES))
     assert all(r.status is Status.OK for r in finished.records) and finished.trouble == 0
     truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
     error = np.linalg.norm(slam.trajectory(finished)[:, :3, 3] - truth[:, :3, 3], axis=1)
@@ -93,7 +93,7 @@ def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, seq
 
 
 def following(frame: Frame) -> Frame:
-    return frame._replace(index=FRAMES, timestamp=frame.timestamp + 1 / 30)
+    return frame._replace(number=FRAMES, timestamp=frame.timestamp + 1 / 30)
 
 
 @pytest.mark.parametrize("how", ["missing", "zero"])

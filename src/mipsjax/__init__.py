@@ -8,6 +8,7 @@ images nor meshes:
     sequence = mipsjax.open_sequence("synth:room")
     state = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
     state = mipsjax.step(state, sequence[1], cfg)
+    state = mipsjax.finish(state, cfg)
     mesh = mipsjax.reconstruct_mesh(state, cfg)
 """
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from mipsjax.policy import Status as Status
     from mipsjax.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
     from mipsjax.slam import SlamState as SlamState
+    from mipsjax.slam import finish as finish
     from mipsjax.slam import start as start
     from mipsjax.slam import step as step
     from mipsjax.slam import trajectory as trajectory
@@ -64,6 +66,7 @@ _PLACES = {
     "preset": "config:preset",
     "reconstruct_mesh": "reconstruct:reconstruct",
     "refine": "core.mapping:refine",
+    "finish": "slam:finish",
     "start": "slam:start",
     "step": "slam:step",
     "track": "core.tracking:track",

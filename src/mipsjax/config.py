@@ -157,9 +157,9 @@ class SearchConfig:
     widening_limit: float = 3.0
     """Largest such factor."""
     momentum: float = 0.1
-    """alpha of Eq. 14: the share of the last radii in the new ones."""
+    """alpha of Eq. 16: the share of the last radii in the new ones."""
     epsilon: float = 1e-3
-    """Smallest radius (Eq. 13)."""
+    """Smallest radius (Eq. 15)."""
     uncertainty: bool = True
     """Off: the fitness is not weighted (the paper's ablation "No U")."""
     entropy_floor: float = 0.3
@@ -183,7 +183,7 @@ class RefineConfig:
     learning_rate: float = 1e-2
     """Of Adam."""
     rgb: float = 1.0
-    """Weight of the colour term of Adam (omega in Eq. 15)."""
+    """Weight of the colour term of Adam (omega in Eq. 17)."""
     robust: float = 0.02
     """Metres, scale of the Cauchy weight."""
 
@@ -252,7 +252,15 @@ PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     loss=LossConfig(cross_entropy=0.0, color_samples=50),
-    map=MapConfig(steps=15, steps_slow=15, pose_rate_slow=1.0, first_steps=500, final_steps=0, pixels=384, learning_rate=1e-2),
+    map=MapConfig(
+        steps=15,
+        steps_slow=15,
+        pose_rate_slow=1.0,
+        first_steps=500,
+        final_steps=0,
+        pixels=384,
+        learning_rate=1e-2,
+    ),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10),
@@ -260,10 +268,15 @@ PAPER = Config(
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
 )
 TINY = Config(
-    field=FieldConfig(hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)),
+    field=FieldConfig(
+        hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
+    ),
     sample=SampleConfig(uniform=4, truncation=6),
     map=MapConfig(steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
-    track=TrackConfig(ro=SearchConfig(particles=128, pixels=48, steps=4), go=RefineConfig(pixels=192, steps=8, smooth_steps=4)),
+    track=TrackConfig(
+        ro=SearchConfig(particles=128, pixels=48, steps=4),
+        go=RefineConfig(pixels=192, steps=8, smooth_steps=4),
+    ),
     mesh=MeshConfig(voxel=0.05),
 )
 PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

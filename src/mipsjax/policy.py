@@ -16,9 +16,9 @@ class Status(StrEnum):
     WEAK = "weak"
     """Mapped, but the next search is wider."""
     LOST = "lost"
-    """Not mapped; its pose is the motion prior's."""
+    """Not mapped; its pose is the last trusted one."""
     SKIPPED = "skipped"
-    """No usable image; its pose is the motion prior's."""
+    """No usable image; its pose is the last trusted one."""
 
 
 class FrameStats(NamedTuple):

@@ -79,16 +79,22 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
         if state is not None:
             state = slam.step(state, frame, core)
         elif reason := anchor_problem(frame):
-            waited.append(FrameRow(frame.index, frame.timestamp, Status.SKIPPED, slam.FrameInfo(note=reason)))
+            waited.append(
+                FrameRow(frame.number, frame.timestamp, Status.SKIPPED, slam.FrameInfo(note=reason))
+            )
         else:
             state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
         step_s.append(perf_counter() - began - read_s[-1])
         status = Status.SKIPPED if state is None else state.records[-1].status
         bad += status is Status.SKIPPED
         tell(status)
+    began = perf_counter()
+    if state is not None:
+        state = slam.finish(state, core)
+    finish_s = perf_counter() - began
     too_bad = bad > cfg.input.max_bad_frames
     end = "bad frames" if too_bad else "interrupted" if len(read_s) < len(sequence) else "done"
-    return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end)
+    return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end, finish_s)
 
 
 def anchor_problem(frame: Frame) -> str:

@@ -42,7 +42,8 @@ class Keyframe(NamedTuple):
 class Record(NamedTuple):
     """One processed frame. Its pose hangs on a keyframe, so that bundle adjustment moves it along."""
 
-    index: int
+    frame: int
+    """Number of the frame in the sequence on disk."""
     timestamp: float
     keyframe: int
     """Place of its keyframe in `SlamState.keyframes`."""
@@ -89,10 +90,16 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     began = perf_counter()
     submap = mapping.create(_key(cfg, INIT, 0), cfg)
     keyframe = _keyframe(frame, 0, np.eye(4), cfg, camera)
-    submap, _, ok = _refine(submap, [keyframe] * cfg.map.frames, [0.0] * cfg.map.frames, cfg.map.first_steps, 0, camera, cfg)
-    info = FrameInfo(keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite")
-    record = Record(frame.index, frame.timestamp, 0, np.eye(4), Status.OK, info)
-    return SlamState(submap, (keyframe,), (record,), np.eye(4) if T_world_sub is None else T_world_sub, camera, 0)
+    submap, _, ok = _refine(
+        submap, [keyframe] * cfg.map.frames, [0.0] * cfg.map.frames, cfg.map.first_steps, 0, camera, cfg
+    )
+    info = FrameInfo(
+        keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
+    )
+    record = Record(frame.number, frame.timestamp, 0, np.eye(4), Status.OK, info)
+    return SlamState(
+        submap, (keyframe,), (record,), np.eye(4) if T_world_sub is None else T_world_sub, camera, 0
+    )
 
 
 def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
@@ -151,7 +158,13 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
 
 
 def _learn(
-    state: SlamState, frame: Frame, T_sub_cam: Pose, decision: Decision, info: tracking.TrackInfo, track_ms: float, cfg: Config
+    state: SlamState,
+    frame: Frame,
+    T_sub_cam: Pose,
+    decision: Decision,
+    info: tracking.TrackInfo,
+    track_ms: float,
+    cfg: Config,
 ) -> SlamState:
     """Local bundle adjustment with the frame, which becomes a keyframe where that was decided."""
     began = perf_counter()
@@ -177,7 +190,9 @@ def _learn(
     )
     record = _record(frame, keyframes, T_sub_cam, decision.status, details)
     trouble = 0 if decision.status is Status.OK else state.trouble + 1
-    return state._replace(submap=submap, keyframes=tuple(keyframes), records=(*state.records, record), trouble=trouble)
+    return state._replace(
+        submap=submap, keyframes=tuple(keyframes), records=(*state.records, record), trouble=trouble
+    )
 
 
 def _coast(
@@ -197,17 +212,29 @@ def _coast(
 
 
 def _refine(
-    submap: mapping.Submap, batch: list[Keyframe], rates: list[float], steps: int, number: int, camera: Intrinsics, cfg: Config, rate: float = 1.0
+    submap: mapping.Submap,
+    batch: list[Keyframe],
+    rates: list[float],
+    steps: int,
+    number: int,
+    camera: Intrinsics,
+    cfg: Config,
+    rate: float = 1.0,
 ) -> tuple[mapping.Submap, list[Pose], bool]:
     frames = mapping.Frames(
-        depth=np.stack([k.depth for k in batch]),
-        color=np.stack([k.color for k in batch]),
-        T_sub_cam=np.stack([k.T_sub_cam for k in batch]).astype(np.float32),
-        movable=np.array(rates, np.float32),
+        depth=jnp.asarray(np.stack([k.depth for k in batch])),
+        color=jnp.asarray(np.stack([k.color for k in batch])),
+        T_sub_cam=jnp.asarray(np.stack([k.T_sub_cam for k in batch]), jnp.float32),
+        movable=jnp.asarray(np.array(rates, np.float32)),
     )
     small = camera.decimated(mapping_stride(camera, cfg))
-    submap, poses, info = mapping.refine(submap, frames, jnp.int32(steps), _key(cfg, MAP, number), small, cfg, np.float32(rate))
-    moved = [_rigid(pose) if rate else k.T_sub_cam for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)]
+    submap, poses, info = mapping.refine(
+        submap, frames, jnp.int32(steps), _key(cfg, MAP, number), small, cfg, np.float32(rate)
+    )
+    moved = [
+        _rigid(pose) if rate else k.T_sub_cam
+        for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)
+    ]
     return submap, moved, bool(info.ok)
 
 
@@ -239,7 +266,9 @@ def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
 
 def _scaled(motion: Pose, ratio: float) -> Pose:
     scaled = np.eye(4)
-    scaled[:3, :3] = Rotation.from_rotvec(ratio * Rotation.from_matrix(motion[:3, :3]).as_rotvec()).as_matrix()
+    scaled[:3, :3] = Rotation.from_rotvec(
+        ratio * Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    ).as_matrix()
     scaled[:3, 3] = ratio * motion[:3, 3]
     return scaled
 
@@ -273,15 +302,19 @@ def _last_pose(state: SlamState) -> Pose:
     return _pose(state, state.records[-1])
 
 
-def _record(frame: Frame, keyframes: list[Keyframe], T_sub_cam: Pose, status: Status, info: FrameInfo) -> Record:
+def _record(
+    frame: Frame, keyframes: list[Keyframe], T_sub_cam: Pose, status: Status, info: FrameInfo
+) -> Record:
     relative = np.linalg.inv(keyframes[-1].T_sub_cam) @ T_sub_cam
-    return Record(frame.index, frame.timestamp, len(keyframes) - 1, relative, status, info)
+    return Record(frame.number, frame.timestamp, len(keyframes) - 1, relative, status, info)
 
 
 def _keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camera: Intrinsics) -> Keyframe:
     assert frame.depth is not None and frame.color is not None
     every = mapping_stride(camera, cfg)
-    return Keyframe(number, frame.depth[::every, ::every].copy(), frame.color[::every, ::every].copy(), T_sub_cam)
+    return Keyframe(
+        number, frame.depth[::every, ::every].copy(), frame.color[::every, ::every].copy(), T_sub_cam
+    )
 
 
 def _info(info: tracking.TrackInfo, track_ms: float) -> FrameInfo:

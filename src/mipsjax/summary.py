@@ -57,12 +57,14 @@ class Run(NamedTuple):
     step_s: tuple[float, ...]
     """Seconds to process each frame."""
     end: Literal["done", "interrupted", "bad frames"]
+    finish_s: float = 0.0
+    """Seconds of the bundle adjustment after the last frame."""
 
     @property
     def rows(self) -> tuple[FrameRow, ...]:
         """All frames that were read."""
         records = () if self.state is None else self.state.records
-        return self.waited + tuple(FrameRow(r.index, r.timestamp, r.status, r.info) for r in records)
+        return self.waited + tuple(FrameRow(r.frame, r.timestamp, r.status, r.info) for r in records)
 
     @property
     def T_truth_cam(self) -> Float64[np.ndarray, "N 4 4"] | None:
@@ -100,6 +102,7 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
     stages = {
         "read": sum(run.read_s),
         "frames": sum(run.step_s),
+        "finish": run.finish_s,
         **seconds,
         "evaluate": perf_counter() - began,
     }

@@ -44,7 +44,7 @@ def prediction(logits) -> Tsdf:
 
 
 def mean_over_rays(term, near) -> float:
-    """1 / |P| sum over rays of 1 / |S_p| sum over samples, as in Eqs. 10 to 13."""
+    """1 / |P| sum over rays of 1 / |S_p| sum over samples, as in Eqs. 9 to 12."""
     total = 0.0
     for p in range(RAYS):
         inside = [s for s in range(SAMPLES) if near[p, s]]

@@ -28,7 +28,7 @@ def test_folder(root: Path) -> None:
     assert sequence.T_world_cam is not None
     np.testing.assert_allclose(sequence.T_world_cam, [pose(number) for number in range(FRAMES)], atol=1e-12)
     frame = sequence[3]
-    assert frame.index == 3 and frame.problem == ""
+    assert frame.number == 3 and frame.problem == ""
     assert frame.color is not None and frame.depth is not None
     assert np.abs(frame.color.astype(int) - color_image(3)).max() <= 6  # JPEG
     np.testing.assert_allclose(frame.depth[1:], 2.03)

@@ -47,7 +47,7 @@ def test_it_is_a_sequence(root: Path) -> None:
     assert len(list(sequence)) == len(sequence) == FRAMES
     with pytest.raises(IndexError):
         sequence[FRAMES]
-    assert sequence[-1].index == FRAMES - 1
+    assert sequence[-1].number == FRAMES - 1
 
 
 @pytest.mark.parametrize("how", ["empty", "truncated", "flipped"])
@@ -193,7 +193,7 @@ def test_no_distortion_needs_no_maps() -> None:
 
 def test_selection_keeps_numbers_times_and_poses(root: Path) -> None:
     sequence = open_folder(root).select(slice(1, None, 2))
-    assert [frame.index for frame in sequence] == [1, 3]
+    assert [frame.number for frame in sequence] == [1, 3]
     np.testing.assert_allclose(sequence.timestamps, [0.1, 0.3])
     assert sequence.T_world_cam is not None
     np.testing.assert_allclose(sequence.T_world_cam, [pose(1), pose(3)], atol=1e-12)

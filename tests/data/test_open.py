@@ -131,7 +131,7 @@ def test_every_sequence_here_is_of_one_layout(tmp_path: Path) -> None:
 def test_frames(tmp_path: Path) -> None:
     root = write_folder(tmp_path / "kitchen")
     sequence = open_sequence(root, frames=parse_frames("1::2"))
-    assert [frame.index for frame in sequence] == [1, 3]
+    assert [frame.number for frame in sequence] == [1, 3]
     with pytest.raises(InputError, match="1 of 5 frames selected, at least 2"):
         open_sequence(root, frames=parse_frames("4:"))
 
@@ -265,4 +265,4 @@ def test_real_sequences(shared_data: Path, folder: str, layout: str, frames: int
     assert (sequence.layout, len(sequence)) == (layout, -(-frames // 7))
     assert (sequence.intrinsics.width, sequence.intrinsics.height) == (320, 240)
     frame = sequence[1]
-    assert frame.index == 7 and frame.problem == ""
+    assert frame.number == 7 and frame.problem == ""

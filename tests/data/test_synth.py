@@ -348,7 +348,7 @@ def test_is_a_sequence() -> None:
     assert frame.color is not None and frame.depth is not None
     assert frame.color.shape == (60, 80, 3) and frame.color.dtype == np.uint8
     assert frame.depth.shape == (60, 80) and frame.depth.dtype == np.float32
-    assert (frame.index, frame.timestamp, frame.problem) == (3, 3 / FPS, "")
+    assert (frame.number, frame.timestamp, frame.problem) == (3, 3 / FPS, "")
     assert len(sequence) == 16 and 10.0 < frame.color.mean() < 240.0
     with pytest.raises(IndexError):
         sequence[16]
@@ -362,7 +362,7 @@ def test_same_name_same_bits(name: str) -> None:
     for frame, position in zip(late, (14, 2), strict=True):
         np.testing.assert_array_equal(frame.color, whole[position].color)
         np.testing.assert_array_equal(frame.depth, whole[position].depth)
-        assert frame.index == position and frame.timestamp == whole.timestamps[position]
+        assert frame.number == position and frame.timestamp == whole.timestamps[position]
 
 
 def test_noise_differs_between_frames_and_from_clean() -> None:

@@ -63,9 +63,7 @@ def grid_shape(pixels: int, height: int, width: int) -> tuple[int, int]:
     return rows, max(1, pixels // rows)
 
 
-def rays(
-    v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
-) -> Float[Array, "P 3"]:
+def rays(v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics) -> Float[Array, "P 3"]:
     """Direction of each pixel with z = 1, camera frame: a point at depth d is d times the ray."""
     return jnp.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, jnp.ones(u.shape)], -1)
 

@@ -5,12 +5,13 @@ All points are in the submap's frame, metres. The distance is positive in front 
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mipsjax.config import FieldConfig
 
@@ -151,7 +152,12 @@ def hash_features(
     hi = lo + HASH_PRIMES[:, None, None]
     mask, start = np.uint32(entries - 1), np.arange(levels, dtype=np.int32)[:, None] * entries
     index = jnp.stack(
-        [((x ^ y ^ z) & mask).astype(jnp.int32) + start for x in (lo[0], hi[0]) for y in (lo[1], hi[1]) for z in (lo[2], hi[2])]
+        [
+            ((x ^ y ^ z) & mask).astype(jnp.int32) + start
+            for x in (lo[0], hi[0])
+            for y in (lo[1], hi[1])
+            for z in (lo[2], hi[2])
+        ]
     )
     flat = table.reshape(levels * entries, features)
     encoded = [_trilinear(flat[:, f][index], offset) for f in range(features)]
@@ -180,9 +186,10 @@ def _hash_width(cfg: FieldConfig) -> int:
 
 def _init_net(key: PRNGKeyArray, widths: tuple[int, ...], hashed: FieldConfig | None = None) -> Net:
     keys = jax.random.split(key, len(widths))
-    pairs = list(zip(widths[:-1], widths[1:], strict=True))
+    pairs = list(pairwise(widths))
     weights = tuple(
-        jax.random.normal(k, pair) * np.float32(np.sqrt(2 / pair[0])) for k, pair in zip(keys[1:], pairs, strict=True)
+        jax.random.normal(k, pair) * np.float32(np.sqrt(2 / pair[0]))
+        for k, pair in zip(keys[1:], pairs, strict=True)
     )
     biases = tuple(jnp.zeros(o) for _, o in pairs)
     table = None

@@ -17,21 +17,21 @@ def masked_mean(values: Float[Array, "*S"], mask: Bool[Array, "*S"] | Float[Arra
 
 
 def d2t(psi: Float[Array, " P"], mask: Bool[Array, " P"]) -> Float[Array, ""]:
-    """Depth-to-TSDF loss (Eq. 9), as a mean over the measured pixels. Square metres."""
+    """Depth-to-TSDF loss (Eq. 8), as a mean over the measured pixels. Square metres."""
     return masked_mean(psi**2, mask)
 
 
 def distance(
     psi: Float[Array, "*S"], target: Float[Array, "*S"], mask: Bool[Array, "*S"]
 ) -> Float[Array, ""]:
-    """Truncation-region loss (Eq. 10) with the mask `near`; free-space loss (Eq. 12) with `free`."""
+    """Truncation-region loss (Eq. 9) with the mask `near`; free-space loss (Eq. 11) with `free`."""
     return masked_mean((psi - target) ** 2, mask)
 
 
 def emd(
     prediction: Tsdf, target: Float[Array, " S"], mask: Bool[Array, " S"], cfg: FieldConfig
 ) -> Float[Array, ""]:
-    """Earth mover's distance of the class distribution to the nearest class of the target (Eq. 11)."""
+    """Earth mover's distance of the class distribution to the nearest class of the target (Eq. 10)."""
     if not cfg.classification:
         return jnp.zeros(())
     step = 2 * cfg.truncation / (cfg.classes - 1)
@@ -54,18 +54,18 @@ def cross_entropy(
 def render_weights(
     psi: Float[Array, "P S"], near: Bool[Array, "P S"], truncation: float
 ) -> Float[Array, "P S"]:
-    """Normalised weights of the samples of each ray, in the truncation region only (Eqs. 4 and 5)."""
+    """Normalised weights of the samples of each ray, in the truncation region only (Eqs. 3 and 4)."""
     raw = jax.nn.sigmoid(psi / truncation) * jax.nn.sigmoid(-psi / truncation) * near
     return raw / jnp.maximum(jnp.sum(raw, -1, keepdims=True), 1e-6)
 
 
 def render(weights: Float[Array, "P S"], values: Float[Array, "P S *C"]) -> Float[Array, "P *C"]:
-    """Weighted sum along each ray: colour (Eq. 5) or depth (Eq. 6)."""
+    """Weighted sum along each ray: colour (Eq. 4) or depth (Eq. 5)."""
     return jnp.einsum("ps,ps...->p...", weights, values)
 
 
 def rgb(
     rendered: Float[Array, "P 3"], measured: Float[Array, "P 3"], mask: Bool[Array, " P"]
 ) -> Float[Array, ""]:
-    """Mean norm of the colour difference (Eq. 14)."""
+    """Mean norm of the colour difference (Eq. 12)."""
     return masked_mean(jnp.sqrt(jnp.sum((rendered - measured) ** 2, -1) + 1e-12), mask)

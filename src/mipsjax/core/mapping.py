@@ -65,7 +65,7 @@ def optimizer(cfg: Config) -> optax.GradientTransformation:
 def create(key: PRNGKeyArray, cfg: Config) -> Submap:
     """A submap that knows nothing."""
     field = nf.init(key, cfg.field)
-    return Submap(field, optimizer(cfg).init(field))
+    return Submap(field, optimizer(cfg).init(field))  # pyright: ignore[reportArgumentType]  (optax names no tuples, but takes any pytree)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
@@ -90,7 +90,9 @@ def refine(
         field, state, twist, pose_state, _ = carry
         poses = moved(frames, twist)
         k = jax.random.fold_in(key, i)
-        loss, (g_field, g_twist) = loss_and_gradient(field, jnp.zeros_like(twist), poses, frames, k, camera, cfg)
+        loss, (g_field, g_twist) = loss_and_gradient(
+            field, jnp.zeros_like(twist), poses, frames, k, camera, cfg
+        )
         change, state = optimizer(cfg).update(g_field, state, field)
         pose_change, pose_state = pose_optimizer.update(g_twist, pose_state)
         field = jax.tree.map(lambda p, c: p + rate * c, field, change)
@@ -122,7 +124,7 @@ def map_loss(
     camera: Intrinsics,
     cfg: Config,
 ) -> Float[Array, ""]:
-    """The mapping loss on one draw of pixels and samples of every frame (Eq. 16)."""
+    """The mapping loss on one draw of pixels and samples of every frame (Eq. 18)."""
     count = frames.depth.shape[0]
     k_pixels, k_rays, k_surface = jax.random.split(key, 3)
     pixels = jax.vmap(draw_pixels, (0, 0, 0, None, None))(
@@ -152,6 +154,7 @@ def map_loss(
         points = jax.lax.stop_gradient(points)
     encoded = nf.encode(field, points, cfg.field)
     net = field.smooth if field.fine is None else field.fine
+    assert net is not None
     prediction = nf.classify(net, encoded, cfg.field)
     if field.fine is not None:
         total += tsdf_loss(prediction, samples, cfg)
@@ -177,7 +180,7 @@ def color_loss(
     pixels: Pixels,
     cfg: Config,
 ) -> Float[Array, ""]:
-    """Colour rendered on some samples of each ray, spread over the truncation region (Eqs. 5 and 14)."""
+    """Colour rendered on some samples of each ray, spread over the truncation region (Eqs. 4 and 12)."""
     rays, count = samples.depth.shape
     some = _color_samples(count, cfg)
     psi = jax.lax.stop_gradient(psi).reshape(rays, count)[:, some]
@@ -192,15 +195,23 @@ def _color_samples(count: int, cfg: Config) -> np.ndarray:
     if cfg.loss.color_samples >= count:
         return np.arange(count)
     first = cfg.sample.uniform
-    return np.unique(np.linspace(first, first + cfg.sample.truncation - 1, cfg.loss.color_samples).round().astype(int))
+    return np.unique(
+        np.linspace(first, first + cfg.sample.truncation - 1, cfg.loss.color_samples).round().astype(int)
+    )
 
 
 def draw_pixels(
-    key: PRNGKeyArray, depth: Float[Array, "H W"], color: UInt8[Array, "H W 3"], camera: Intrinsics, cfg: Config
+    key: PRNGKeyArray,
+    depth: Float[Array, "H W"],
+    color: UInt8[Array, "H W 3"],
+    camera: Intrinsics,
+    cfg: Config,
 ) -> Pixels:
     """A stripe grid of pixels, shifted by a random part of a cell."""
     height, width = depth.shape
-    v, u = pixel_grid(*grid_shape(cfg.map.pixels, height, width), jax.random.uniform(key, (2,)), height, width)
+    v, u = pixel_grid(
+        *grid_shape(cfg.map.pixels, height, width), jax.random.uniform(key, (2,)), height, width
+    )
     ray = rays(v, u, camera)
     slope = surface_slope(depth, v, u, ray, camera) if cfg.sample.perpendicular else jnp.ones(u.shape)
     return Pixels(ray, depth[v, u], slope, color[v, u].astype(jnp.float32) / 255)

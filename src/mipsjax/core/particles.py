@@ -65,7 +65,7 @@ def pose_cost(
     cfg: FieldConfig,
     search: SearchConfig,
 ) -> Float[Array, ""]:
-    """Uncertainty-weighted depth-to-TSDF cost of one pose (Eq. 11), as a weighted mean: square metres."""
+    """Uncertainty-weighted depth-to-TSDF cost of one pose (Eq. 13), as a weighted mean: square metres."""
     p_sub = p_cam @ T_sub_cam[:3, :3].T + T_sub_cam[None, :3, 3]
     prediction = nf.tsdf(field, p_sub, cfg, "search")
     weight = mask.astype(jnp.float32)
@@ -97,7 +97,7 @@ def step(
     cfg: FieldConfig,
     search: SearchConfig,
 ) -> Swarm:
-    """One iteration: advantage set, move, rescale (Eqs. 12 to 14)."""
+    """One iteration: advantage set, move, rescale (Eqs. 14 to 16)."""
     deltas = particles * swarm.radii[None]
     costs = fitness(field, swarm.T_sub_cam @ delta_pose(deltas), p_cam, mask, cfg, search)
     costs = jnp.nan_to_num(costs, nan=jnp.inf)
@@ -114,7 +114,7 @@ def step(
     cost = jnp.where(found, end_costs[which], costs[0])
     direction = jnp.abs(move / swarm.radii)
     direction = direction / jnp.maximum(jnp.linalg.norm(direction), 1e-9)
-    # Eq. 13 scales the radii by the cost; here by the residual in units of the truncation, and relative to the
+    # Eq. 15 scales the radii by the cost; here by the residual in units of the truncation, and relative to the
     # last radii, so that metres and quaternion parts are not mixed.
     level = jnp.sqrt(cost) / cfg.truncation
     target = jnp.where(found, swarm.radii * jnp.clip(level * (0.5 + direction), 0.3, 1.0), swarm.radii * 0.6)

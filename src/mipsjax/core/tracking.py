@@ -57,7 +57,11 @@ class TrackInfo(NamedTuple):
 
 
 def draw_points(
-    key: PRNGKeyArray, depth: Float[Array, "H W"], color: UInt8[Array, "H W 3"], pixels: int, camera: Intrinsics
+    key: PRNGKeyArray,
+    depth: Float[Array, "H W"],
+    color: UInt8[Array, "H W 3"],
+    pixels: int,
+    camera: Intrinsics,
 ) -> Points:
     """Points of a stripe grid of about `pixels` cells, shifted by a random part of a cell."""
     height, width = depth.shape
@@ -116,14 +120,18 @@ def levenberg_marquardt(
 def adam(
     field: nf.Field, T: Float[Array, "4 4"], points: Points, key: PRNGKeyArray, cfg: Config
 ) -> Float[Array, "4 4"]:
-    """First-order refinement of d2t + omega rgb (Eq. 15), as in the paper."""
+    """First-order refinement of d2t + omega rgb (Eq. 17), as in the paper."""
     optimizer = optax.adam(cfg.track.go.learning_rate)
 
     def loss(twist):
         T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
         psi = nf.tsdf(field, transform(T_new, points.p_cam), cfg.field).psi
         total = losses.d2t(psi, points.mask)
-        return total + cfg.track.go.rgb * _rgb_loss(field, T_new, points, key, cfg) if cfg.track.go.rgb else total
+        return (
+            total + cfg.track.go.rgb * _rgb_loss(field, T_new, points, key, cfg)
+            if cfg.track.go.rgb
+            else total
+        )
 
     def step(carry, _):
         twist, state = carry
@@ -138,7 +146,9 @@ def adam(
 def _rgb_loss(field, T, points: Points, key, cfg: Config) -> Float[Array, ""]:
     tau = cfg.field.truncation
     measured = points.p_cam[:, 2]
-    depth = sampling.stratified(key, jnp.maximum(measured - tau, sampling.NEAR), measured + tau, cfg.sample.truncation)
+    depth = sampling.stratified(
+        key, jnp.maximum(measured - tau, sampling.NEAR), measured + tau, cfg.sample.truncation
+    )
     ray = points.p_cam / jnp.maximum(measured, sampling.NEAR)[:, None]
     p_sub = transform(T, (ray[:, None] * depth[..., None]).reshape(-1, 3))
     psi = nf.tsdf(field, p_sub, cfg.field).psi.reshape(depth.shape)

@@ -13,7 +13,7 @@ from mipsjax.core.camera import Intrinsics
 class Frame(NamedTuple):
     """One RGB-D frame as the rest of the program sees it."""
 
-    index: int
+    number: int
     """Number of the frame in the sequence on disk, before any selection of frames."""
     timestamp: float
     """Seconds."""

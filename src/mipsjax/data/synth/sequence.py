@@ -83,7 +83,7 @@ class SynthSequence:
             color, depth = self._measured(index, color, depth)
         low, high = self._depth_range
         depth = np.where((depth >= low) & (depth <= high), depth, np.float32(0.0))
-        return Frame(index=index, timestamp=time, color=color, depth=depth)
+        return Frame(number=index, timestamp=time, color=color, depth=depth)
 
     def _shutter(self, time: float) -> Float64[np.ndarray, "K"]:
         """Times in seconds at which light is gathered for one frame."""
