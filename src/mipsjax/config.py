@@ -271,7 +271,7 @@ TINY = Config(
     field=FieldConfig(
         hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
     ),
-    sample=SampleConfig(uniform=4, truncation=6),
+    sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
     map=MapConfig(steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),

@@ -35,7 +35,7 @@ CFG = Config(
         hash_hidden=(16,),
         color_hidden=(16,),
     ),
-    sample=SampleConfig(uniform=6, truncation=8, surface=0),
+    sample=SampleConfig(uniform=6, truncation=8, surface=0, perpendicular=False),
     loss=LossConfig(color_samples=8),  # all of the truncation region, on both sides of the surface
     map=MapConfig(frames=5, pixels=200, learning_rate=4e-3, pose_learning_rate=1e-3),
     track=TrackConfig(
