@@ -1,0 +1,52 @@
+"""Tracking accuracy and speed: the real kitchen at four camera speeds, and the synthetic rooms.
+
+    python experiments/tracking.py [--seeds 0 1 2] [--strides 1 4 8 16] [--without-ro] [--synth]
+
+Writes `tracking.csv`: a row a run, ATE RMSE after rigid alignment, statuses, frames a second without the first
+frames (compilation), peak memory of the process so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from common import DATA, changed, run, show, use_compilation_cache, write_rows
+
+from mipsjax.config import Config
+
+SYNTH = ("room", "room+noise", "room-fast", "room-fast+noise+blur")
+
+
+def kitchen(stride: int, seed: int, cfg: Config) -> dict[str, Any]:
+    return run(str(DATA / "redkitchen"), cfg, frames=slice(0, 1000, stride), seed=seed).row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
+    parser.add_argument("--strides", type=int, nargs="*", default=[1, 4, 8, 16])
+    parser.add_argument("--without-ro", action="store_true", help="also the fastest stride without RO")
+    parser.add_argument("--synth", action="store_true", help="also the synthetic rooms")
+    options = parser.parse_args()
+    use_compilation_cache()
+    rows = []
+
+    def add(name: str, row: dict[str, Any]) -> None:
+        rows.append({"method": name} | row)
+        show(rows[-1])
+        write_rows("tracking", rows)
+
+    for seed in options.seeds:
+        for stride in sorted(options.strides, reverse=True):
+            add("default", kitchen(stride, seed, Config()))
+        if options.without_ro:
+            add("no RO", kitchen(max(options.strides), seed, changed(Config(), "track.ro", when="never")))
+        for name in SYNTH if options.synth else ():
+            add("default", run(f"synth:{name}", Config(), seed=seed).row)
+
+
+if __name__ == "__main__":
+    main()
