@@ -14,8 +14,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from common import OUT, Run, run, show, use_compilation_cache, write_rows
 
+from common import OUT, Run, run, show, use_compilation_cache, write_rows
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth.mesh import reference_mesh

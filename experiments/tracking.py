@@ -12,7 +12,6 @@ import argparse
 from typing import Any
 
 from common import DATA, changed, run, show, use_compilation_cache, write_rows
-
 from mipsjax.config import Config
 
 SYNTH = ("room", "room+noise", "room-fast", "room-fast+noise+blur")
