@@ -16,11 +16,12 @@ import jaxlie
 import numpy as np
 
 from common import changed, show, use_compilation_cache, write_rows
-from mipsjax import slam
+from mipsjax.bundle import adjust, make_keyframe
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
+from mipsjax.state import distance
 
 OFFSET_M, OFFSET_RAD = 0.3, np.radians(30)
 DONE_M, DONE_RAD = 0.01, np.radians(0.5)
@@ -32,12 +33,12 @@ def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Submap, list[np.nda
     """A submap fitted to evenly spaced frames, and the true pose of each frame in it."""
     truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
     picked = np.linspace(0, len(sequence) - 1, KEYFRAMES).astype(int)
-    keyframes = [slam._keyframe(sequence[i], i, truth[i], cfg, sequence.intrinsics) for i in picked]
+    keyframes = [make_keyframe(sequence[i], i, truth[i], cfg, sequence.intrinsics) for i in picked]
     submap = mapping.create(jax.random.key(cfg.seed), cfg)
     rng = np.random.default_rng(cfg.seed)
     for number in range(STEPS // cfg.map.steps):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
-        submap, _, _ = slam._refine(
+        submap, _, _ = adjust(
             submap, batch, [0.0] * cfg.map.frames, cfg.map.steps, number, sequence.intrinsics, cfg
         )
     return submap, list(truth)
@@ -74,7 +75,7 @@ def share(
             sequence.intrinsics,
             cfg,
         )
-        metres, radians = slam._distance(truth[frame], np.asarray(T, np.float64))
+        metres, radians = distance(truth[frame], np.asarray(T, np.float64))
         done += metres < DONE_M and radians < DONE_RAD
     return done / count
 

@@ -18,7 +18,9 @@ from mipsjax import slam
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
+from mipsjax.final import finish
 from mipsjax.host.metrics import absolute_error, relative_error
+from mipsjax.state import SlamState, trajectory
 
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"
@@ -26,7 +28,7 @@ WARM_UP = 5  # frames after which the clock starts: by then everything is compil
 
 
 class Run(NamedTuple):
-    state: slam.SlamState
+    state: SlamState
     sequence: Sequence
     row: dict[str, Any]
 
@@ -43,18 +45,18 @@ def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -
             began = time.perf_counter()
         state = slam.step(state, sequence[position], cfg)
     seconds = time.perf_counter() - began
-    state = slam.finish(state, cfg)
+    state = finish(state, cfg)
     row = {"sequence": Path(path).name, "frames": len(sequence), "stride": frames.step or 1, "seed": seed}
     return Run(state, sequence, row | figures(state, sequence, seconds))
 
 
-def figures(state: slam.SlamState, sequence: Sequence, seconds: float) -> dict[str, Any]:
+def figures(state: SlamState, sequence: Sequence, seconds: float) -> dict[str, Any]:
     """ATE RMSE after rigid alignment over all frames, RPE over one frame, statuses, speed, memory."""
     statuses = Counter(record.status.value for record in state.records)
     timed = [record.info for record in state.records[WARM_UP:]]
     row: dict[str, Any] = {}
     if sequence.T_world_cam is not None:
-        poses = slam.trajectory(state)
+        poses = trajectory(state)
         ate, rpe = absolute_error(poses, sequence.T_world_cam), relative_error(poses, sequence.T_world_cam)
         row |= {"ate_cm": 100 * ate.rmse_m, "ate_max_cm": 100 * ate.max_m, "rpe_cm": 100 * rpe.trans_rmse_m}
     return row | {
@@ -71,7 +73,7 @@ def figures(state: slam.SlamState, sequence: Sequence, seconds: float) -> dict[s
     }
 
 
-def map_bytes(state: slam.SlamState) -> int:
+def map_bytes(state: SlamState) -> int:
     """Size of the networks of the submap."""
     return sum(leaf.nbytes for leaf in jax.tree.leaves(state.submap.field))
 

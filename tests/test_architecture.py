@@ -19,7 +19,9 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"errors", "config"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
-    frozenset({"slam"}),
+    frozenset({"state"}),
+    frozenset({"bundle"}),
+    frozenset({"slam", "final"}),
     frozenset({"reconstruct", "outputs", "summary", "options", "commandline", "report", "viewer"}),
     frozenset({"run", "evaluate"}),
 )

@@ -18,6 +18,7 @@ import pytest
 
 import running
 from mipsjax import slam
+from mipsjax.state import SlamState
 from running import FRAMES, Program, Result, image, read, write
 
 # Fixtures: as assignments, so that parameters of the same name are no redefinitions of an import
@@ -233,7 +234,7 @@ def test_40_41_a_signal_finishes_the_frame(
 ) -> None:
     step = slam.step
 
-    def interrupted(state: slam.SlamState, *rest: object) -> slam.SlamState:
+    def interrupted(state: SlamState, *rest: object) -> SlamState:
         if len(state.records) == BAD:
             os.kill(os.getpid(), number)
         return step(state, *rest)  # pyright: ignore[reportArgumentType]

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from mipsjax import outputs, slam
+from mipsjax import outputs
+from mipsjax.bundle import make_keyframe
 from mipsjax.config import Config, preset
 from mipsjax.core import mapping
 from mipsjax.data.open import open_sequence
@@ -23,6 +24,7 @@ from mipsjax.errors import OutputError
 from mipsjax.host.render import write_atomically
 from mipsjax.policy import Status
 from mipsjax.reconstruct import observed_points, reconstruct
+from mipsjax.state import FrameInfo, Record, SlamState
 from mipsjax.summary import FrameRow, Run, metrics_content, verdict
 
 CFG = preset("tiny")
@@ -34,24 +36,24 @@ def run() -> Run:
     sequence = open_sequence("synth:tiny", frames=slice(4))
     assert isinstance(sequence, SynthSequence) and sequence.T_world_cam is not None
     frames = [sequence[position] for position in range(4)]
-    keyframe = slam._keyframe(frames[1], 0, np.eye(4), CFG, sequence.intrinsics)
+    keyframe = make_keyframe(frames[1], 0, np.eye(4), CFG, sequence.intrinsics)
     infos = [
-        slam.FrameInfo(),
-        slam.FrameInfo(residual_after=float("inf"), note='no, "depth"'),
-        slam.FrameInfo(),
+        FrameInfo(),
+        FrameInfo(residual_after=float("inf"), note='no, "depth"'),
+        FrameInfo(),
     ]
     records = tuple(
-        slam.Record(frame.number, frame.timestamp, 0, np.eye(4), status, info)
+        Record(frame.number, frame.timestamp, 0, np.eye(4), status, info)
         for frame, info, status in zip(frames[1:], infos, (Status.OK, Status.SKIPPED, Status.OK), strict=True)
     )
     submap = mapping.create(jax.random.key(0), CFG)
-    state = slam.SlamState(submap, (keyframe,), records, sequence.T_world_cam[1], sequence.intrinsics, 0)
-    waited = (FrameRow(0, 0.0, Status.SKIPPED, slam.FrameInfo(note="no depth")),)
+    state = SlamState(submap, (keyframe,), records, sequence.T_world_cam[1], sequence.intrinsics, 0)
+    waited = (FrameRow(0, 0.0, Status.SKIPPED, FrameInfo(note="no depth")),)
     return Run(sequence, state, waited, (0.1,) * 4, (0.2,) * 4, "done")
 
 
 def row(status: str) -> FrameRow:
-    return FrameRow(0, 0.0, Status(status), slam.FrameInfo())
+    return FrameRow(0, 0.0, Status(status), FrameInfo())
 
 
 @pytest.mark.parametrize(

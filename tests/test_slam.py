@@ -11,6 +11,7 @@ from mipsjax.config import PRESETS, InputConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.policy import Status
+from mipsjax.state import SlamState, trajectory
 
 CFG = PRESETS["tiny"]
 FRAMES = 6
@@ -26,7 +27,7 @@ def frames(sequence) -> list[Frame]:
     return [sequence[i] for i in range(FRAMES)]
 
 
-def run(frames: list[Frame], camera) -> slam.SlamState:
+def run(frames: list[Frame], camera) -> SlamState:
     state = slam.start(frames[0], camera, CFG)
     for frame in frames[1:]:
         state = slam.step(state, frame, CFG)
@@ -34,11 +35,11 @@ def run(frames: list[Frame], camera) -> slam.SlamState:
 
 
 @pytest.fixture(scope="module")
-def finished(frames, sequence) -> slam.SlamState:
+def finished(frames, sequence) -> SlamState:
     return run(frames, sequence.intrinsics)
 
 
-def same_map(a: slam.SlamState, b: slam.SlamState) -> bool:
+def same_map(a: SlamState, b: SlamState) -> bool:
     """Bit for bit the same networks, optimiser and keyframes."""
 
     def leaves(state):
@@ -52,23 +53,23 @@ def test_frames_are_tracked(finished, sequence):
     assert [r.frame for r in finished.records] == list(range(FRAMES))
     assert all(r.status is Status.OK for r in finished.records) and finished.trouble == 0
     truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
-    error = np.linalg.norm(slam.trajectory(finished)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    error = np.linalg.norm(trajectory(finished)[:, :3, 3] - truth[:, :3, 3], axis=1)
     # Tens of pixels and a few steps on purpose; the camera itself moves by more than this
     assert error.max() < 0.03
 
 
 def test_poses_are_rigid(finished):
-    for T in slam.trajectory(finished):
+    for T in trajectory(finished):
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1, abs=1e-9)
         np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
 def test_the_first_pose_is_the_one_asked_for(frames, sequence, finished):
-    np.testing.assert_array_equal(slam.trajectory(finished)[0], np.eye(4))
+    np.testing.assert_array_equal(trajectory(finished)[0], np.eye(4))
     T = sequence.T_world_cam[0]
     state = slam.start(frames[0], sequence.intrinsics, CFG, T)
-    np.testing.assert_allclose(slam.trajectory(state)[0], T, atol=1e-12)
+    np.testing.assert_allclose(trajectory(state)[0], T, atol=1e-12)
 
 
 def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, sequence, finished):
@@ -88,7 +89,7 @@ def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, seq
         assert compiled, "the listener hears compilations"
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    np.testing.assert_array_equal(slam.trajectory(again), slam.trajectory(finished))
+    np.testing.assert_array_equal(trajectory(again), trajectory(finished))
     assert same_map(again, finished)
 
 
@@ -105,7 +106,7 @@ def test_a_frame_without_depth_is_skipped_and_counted(finished, frames, how):
     assert len(after.records) == FRAMES + 1 and record.status is Status.SKIPPED
     assert record.info.note == ("cut short" if how == "missing" else "no depth")
     assert after.trouble == 1 and same_map(after, finished)
-    np.testing.assert_allclose(slam.trajectory(after)[-1], slam.trajectory(after)[-2], atol=1e-12)
+    np.testing.assert_allclose(trajectory(after)[-1], trajectory(after)[-2], atol=1e-12)
 
 
 def test_a_frame_without_color_is_tracked_but_not_mapped(finished, frames):
@@ -114,7 +115,7 @@ def test_a_frame_without_color_is_tracked_but_not_mapped(finished, frames):
     assert record.status is Status.OK and record.info.map_steps == 0 and not record.info.keyframe
     assert same_map(after, finished)
     # The same view as the frame before, so about the same pose
-    moved = np.linalg.norm(slam.trajectory(after)[-1][:3, 3] - slam.trajectory(after)[-2][:3, 3])
+    moved = np.linalg.norm(trajectory(after)[-1][:3, 3] - trajectory(after)[-2][:3, 3])
     assert moved < 0.02
 
 
@@ -129,7 +130,7 @@ def test_nothing_is_learned_from_a_lost_frame(finished, frames):
     record = after.records[-1]
     assert record.status is Status.LOST and record.info.searched and after.trouble == 1
     assert same_map(after, finished)
-    assert np.isfinite(slam.trajectory(after)).all()
+    assert np.isfinite(trajectory(after)).all()
 
 
 def test_tracking_goes_on_after_a_lost_frame(finished, frames):
@@ -140,7 +141,7 @@ def test_tracking_goes_on_after_a_lost_frame(finished, frames):
 
 def test_states_are_values(finished, frames):
     """A step returns a new state and leaves the one it was given as it was."""
-    before = slam.trajectory(finished)
+    before = trajectory(finished)
     slam.step(finished, following(frames[-1]), CFG)
-    np.testing.assert_array_equal(slam.trajectory(finished), before)
+    np.testing.assert_array_equal(trajectory(finished), before)
     assert len(finished.records) == FRAMES

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from mipsjax.errors import MipsjaxError as MipsjaxError
     from mipsjax.errors import OutputError as OutputError
     from mipsjax.errors import TrackingLostError as TrackingLostError
+    from mipsjax.final import finish as finish
     from mipsjax.options import validate as validate
     from mipsjax.policy import Status as Status
     from mipsjax.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
-    from mipsjax.slam import SlamState as SlamState
-    from mipsjax.slam import finish as finish
     from mipsjax.slam import start as start
     from mipsjax.slam import step as step
-    from mipsjax.slam import trajectory as trajectory
+    from mipsjax.state import SlamState as SlamState
+    from mipsjax.state import trajectory as trajectory
 
     __version__: str
 
@@ -57,7 +57,7 @@ _PLACES = {
     "MipsjaxError": "errors:MipsjaxError",
     "OutputError": "errors:OutputError",
     "Sequence": "data.sequence:Sequence",
-    "SlamState": "slam:SlamState",
+    "SlamState": "state:SlamState",
     "Status": "policy:Status",
     "Submap": "core.mapping:Submap",
     "TrackingLostError": "errors:TrackingLostError",
@@ -66,11 +66,11 @@ _PLACES = {
     "preset": "config:preset",
     "reconstruct_mesh": "reconstruct:reconstruct",
     "refine": "core.mapping:refine",
-    "finish": "slam:finish",
+    "finish": "final:finish",
     "start": "slam:start",
     "step": "slam:step",
     "track": "core.tracking:track",
-    "trajectory": "slam:trajectory",
+    "trajectory": "state:trajectory",
     "validate": "options:validate",
 }
 

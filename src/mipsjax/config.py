@@ -66,9 +66,9 @@ class FieldConfig:
 class SampleConfig:
     """Samples along each ray (paper: 20 + 20 + 10)."""
 
-    uniform: int = 6
-    """Over free space and the truncation region."""
-    truncation: int = 10
+    uniform: int = 1
+    """Over free space and the truncation region. Few samples on many rays teach more than the reverse."""
+    truncation: int = 3
     """Within the truncation region."""
     surface: int = 0
     """Around the sample with the smallest distance, in a second phase."""
@@ -90,7 +90,7 @@ class LossConfig:
     cross_entropy: float = 3.0
     """Of the two-hot cross entropy in both regions; not in the paper. Its gradient does not vanish where the
     distribution is certain and wrong, which the squared terms' does: a new surface is learned in fewer steps."""
-    color_samples: int = 4
+    color_samples: int = 3
     """Samples of the truncation region on each ray on which colour is rendered (paper: all)."""
 
 
@@ -98,9 +98,9 @@ class LossConfig:
 class MapConfig:
     """Local bundle adjustment."""
 
-    steps: int = 16
+    steps: int = 32
     """Each frame of a fast camera, once a submap is initialised (paper: 15 in one place, 10 in another, always)."""
-    steps_slow: int = 6
+    steps_slow: int = 12
     """The same where the camera has hardly moved since the last frame; in between, in proportion to the motion."""
     motion: float = 0.1
     """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""
@@ -111,10 +111,12 @@ class MapConfig:
     background thread has refined each submap many times over by then."""
     frames: int = 5
     """The current frame, the anchor, and randomly chosen keyframes."""
-    pixels: int = 128
+    pixels: int = 256
     """Of each frame in each step (paper: 384)."""
     learning_rate: float = 1e-2
-    pose_learning_rate: float = 1e-3
+    momentum: float = 0.8
+    """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
+    pose_learning_rate: float = 2e-3
     """Of the twist of each frame, metres and radians."""
     pose_rate_slow: float = 0.1
     """Share of that rate where the camera has hardly moved: Adam's first steps are as long as its rate however
@@ -176,16 +178,23 @@ class RefineConfig:
 
     method: Literal["adam", "lm", "never"] = "lm"
     """`adam` on d2t + rgb as in the paper; `lm`: robust second-order steps on d2t."""
-    pixels: int = 768
-    steps: int = 15
+    pixels: int = 2304
+    steps: int = 10
+    smooth_pixels: int = 768
+    """The same where there is a smooth field besides the fine one, for the steps on it that come first."""
     smooth_steps: int = 7
-    """Steps on the smooth field before those on the fine one, where there are two."""
+    final_steps: int = 4
+    """Of a last alignment of every frame to the finished map, with `lm`; 0 is none, as in the paper."""
     learning_rate: float = 1e-2
     """Of Adam."""
     rgb: float = 1.0
     """Weight of the colour term of Adam (omega in Eq. 17)."""
     robust: float = 0.02
     """Metres, scale of the Cauchy weight."""
+    uncertainty: bool = True
+    """Points are weighted by their uncertainty, with `lm`; the paper does so in RO only."""
+    entropy_floor: float = 0.3
+    """Nats; bounds that weight of a certain point."""
 
 
 @dataclass(frozen=True)
@@ -259,11 +268,12 @@ PAPER = Config(
         first_steps=500,
         final_steps=0,
         pixels=384,
-        learning_rate=1e-2,
+        momentum=0.9,
+        pose_learning_rate=1e-3,
     ),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
-        go=RefineConfig(method="adam", pixels=384, steps=10),
+        go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False),
     ),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
 )
@@ -272,10 +282,10 @@ TINY = Config(
         hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
     ),
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
-    map=MapConfig(steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
+    map=MapConfig(pose_learning_rate=1e-3, steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
-        go=RefineConfig(pixels=192, steps=8, smooth_steps=4),
+        go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
     ),
     mesh=MeshConfig(voxel=0.05),
 )

@@ -30,7 +30,7 @@ from mipsjax.host.meshing import export_ply
 from mipsjax.host.render import save_picture, up_direction, write_atomically
 from mipsjax.options import to_dict
 from mipsjax.policy import Status
-from mipsjax.slam import FrameInfo, trajectory
+from mipsjax.state import FrameInfo, trajectory
 from mipsjax.summary import SCHEMA_VERSION, FrameRow, Run, metrics_content, verdict
 
 try:

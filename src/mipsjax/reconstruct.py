@@ -12,11 +12,12 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Float32, Float64
 
+from mipsjax.bundle import mapping_stride
 from mipsjax.config import Config, FieldConfig
 from mipsjax.core import field as nf
 from mipsjax.core.camera import Intrinsics
 from mipsjax.host.meshing import extract
-from mipsjax.slam import Keyframe, SlamState, mapping_stride
+from mipsjax.state import Keyframe, SlamState
 
 CHUNK_POINTS = 65536
 """Points of one compiled call: few calls for a room, tens of megabytes of activations."""

@@ -30,8 +30,10 @@ from mipsjax.config import Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
 from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
+from mipsjax.final import finish
 from mipsjax.policy import Status
 from mipsjax.reconstruct import reconstruct
+from mipsjax.state import FrameInfo, Pose, SlamState
 from mipsjax.summary import FrameRow, Run, verdict
 
 INTERRUPTED = 130
@@ -65,7 +67,7 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
 
     The map starts with the first frame that has colour and enough depth; frames before it are passed over.
     """
-    state: slam.SlamState | None = None
+    state: SlamState | None = None
     waited: list[FrameRow] = []
     read_s: list[float] = []
     step_s: list[float] = []
@@ -79,9 +81,7 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
         if state is not None:
             state = slam.step(state, frame, core)
         elif reason := anchor_problem(frame):
-            waited.append(
-                FrameRow(frame.number, frame.timestamp, Status.SKIPPED, slam.FrameInfo(note=reason))
-            )
+            waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
         else:
             state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
         step_s.append(perf_counter() - began - read_s[-1])
@@ -90,7 +90,7 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
         tell(status)
     began = perf_counter()
     if state is not None:
-        state = slam.finish(state, core)
+        state = finish(state, core)
     finish_s = perf_counter() - began
     too_bad = bad > cfg.input.max_bad_frames
     end = "bad frames" if too_bad else "interrupted" if len(read_s) < len(sequence) else "done"
@@ -204,7 +204,7 @@ def _of_the_method(cfg: Config) -> Config:
     return replace(cfg, input=InputConfig(), mesh=MeshConfig())
 
 
-def _true_pose(sequence: Sequence, position: int) -> slam.Pose | None:
+def _true_pose(sequence: Sequence, position: int) -> Pose | None:
     """Where the first frame is in the world, if that is known."""
     if sequence.T_world_cam is None or not np.isfinite(sequence.T_world_cam[position]).all():
         return None

@@ -16,7 +16,7 @@ from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import InputError
 from mipsjax.host import metrics, surface
 from mipsjax.policy import Status
-from mipsjax.slam import FrameInfo, SlamState, trajectory
+from mipsjax.state import FrameInfo, SlamState, trajectory
 
 try:
     import resource

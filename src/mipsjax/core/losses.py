@@ -16,6 +16,11 @@ def masked_mean(values: Float[Array, "*S"], mask: Bool[Array, "*S"] | Float[Arra
     return jnp.sum(values * weight) / jnp.maximum(jnp.sum(weight), 1)
 
 
+def certainty(entropy: Float[Array, " P"], floor: float) -> Float[Array, " P"]:
+    """Weight 1 / h^2 of a point (Eq. 13), bounded by a floor on the entropy and scaled to at most 1."""
+    return floor**2 / (entropy**2 + floor**2)
+
+
 def d2t(psi: Float[Array, " P"], mask: Bool[Array, " P"]) -> Float[Array, ""]:
     """Depth-to-TSDF loss (Eq. 8), as a mean over the measured pixels. Square metres."""
     return masked_mean(psi**2, mask)

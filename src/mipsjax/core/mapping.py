@@ -59,7 +59,7 @@ class MapInfo(NamedTuple):
 
 def optimizer(cfg: Config) -> optax.GradientTransformation:
     """Adam on all networks."""
-    return optax.adam(cfg.map.learning_rate, b2=0.99)
+    return optax.adam(cfg.map.learning_rate, b1=cfg.map.momentum, b2=0.99)
 
 
 def create(key: PRNGKeyArray, cfg: Config) -> Submap:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from mipsjax.config import FieldConfig, SearchConfig
 from mipsjax.core import field as nf
+from mipsjax.core import losses
 
 # Poses per chunk of the fitness: keeps the activations of one chunk in the processor's cache.
 CHUNK_POINTS = 8192
@@ -70,7 +71,7 @@ def pose_cost(
     prediction = nf.tsdf(field, p_sub, cfg, "search")
     weight = mask.astype(jnp.float32)
     if search.uncertainty:
-        weight = weight / (prediction.entropy**2 + search.entropy_floor**2)
+        weight = weight * losses.certainty(prediction.entropy, search.entropy_floor)
     return jnp.sum(weight * prediction.psi**2) / jnp.maximum(jnp.sum(weight), 1e-6)
 
 

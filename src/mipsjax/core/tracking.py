@@ -88,16 +88,23 @@ def levenberg_marquardt(
 ) -> Float[Array, "4 4"]:
     """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
 
+    Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement.
     """
     scale = cfg.track.go.robust
 
+    def distance(p_sub):
+        prediction = nf.tsdf(field, p_sub, cfg.field, part)
+        return prediction.psi, prediction.entropy
+
     def system(T):
-        psi, pull = jax.vjp(lambda p: nf.tsdf(field, p, cfg.field, part).psi, transform(T, points.p_cam))
+        psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
         gradient = pull(jnp.ones_like(psi))[0] @ T[:3, :3]
         jacobian = jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
         weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
+        if cfg.track.go.uncertainty:
+            weight *= losses.certainty(entropy, cfg.track.go.entropy_floor)
         weighted = jacobian.T * weight[None]
         return jnp.sum(robust_cost(psi, scale) * points.mask), weighted @ jacobian, weighted @ psi
 
@@ -174,20 +181,21 @@ def track(
     candidate, and RO then GO follow where that did not converge; the better end is kept. `widening` is a factor
     on the swarm's first radii.
     """
-    k_go, k_ro, k_adam = jax.random.split(key, 3)
-    ro = cfg.track.ro
-    points = draw_points(k_go, depth, color, cfg.track.go.pixels, camera)
-    search_cost = jax.vmap(lambda T: measure_fit(field, T, points, "search", cfg).residual)(candidates)
+    k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
+    ro, go = cfg.track.ro, cfg.track.go
+    points = draw_points(k_go, depth, color, go.pixels, camera)
+    coarse = draw_points(k_smooth, depth, color, go.smooth_pixels, camera)
+    search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
     start = candidates[jnp.argmin(search_cost)]
     before = measure_fit(field, start, points, "whole", cfg)
 
     def refined(T):
-        if cfg.track.go.method == "adam":
+        if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
-        elif cfg.track.go.method == "lm":
+        elif go.method == "lm":
             if cfg.field.encoding == "both":
-                T = levenberg_marquardt(field, T, points, "search", cfg.track.go.smooth_steps, cfg)
-            T = levenberg_marquardt(field, T, points, "whole", cfg.track.go.steps, cfg)
+                T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg)
+            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg)
         return T, measure_fit(field, T, points, "whole", cfg)
 
     def searched(T):
@@ -209,6 +217,30 @@ def track(
             T, after = jax.lax.cond(used_ro, again, lambda: (T, after))
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     return jnp.where(ok, T, start), TrackInfo(before, after, used_ro, ok)
+
+
+@partial(jax.jit, static_argnames=("camera", "cfg"))
+def align(
+    field: nf.Field,
+    depth: Float[Array, "F H W"],
+    T: Float[Array, "F 4 4"],
+    camera: Intrinsics,
+    cfg: Config,
+) -> Float[Array, "F 4 4"]:
+    """Poses of F frames after a few second-order steps on every pixel of their (small) depth images.
+
+    A frame that does not come out finite stays where it was.
+    """
+    v, u = jnp.mgrid[: camera.height, : camera.width].reshape(2, -1)
+    ray = rays(v, u, camera)
+
+    def one(d, T):
+        d = d.reshape(-1)
+        points = Points(ray * d[:, None], jnp.zeros_like(ray), d > 0)
+        there = levenberg_marquardt(field, T, points, "whole", cfg.track.go.final_steps, cfg)
+        return jnp.where(jnp.all(jnp.isfinite(there)), there, T)
+
+    return jax.vmap(one)(depth, T)
 
 
 def search(

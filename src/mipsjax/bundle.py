@@ -1,0 +1,66 @@
+"""Local bundle adjustment on the host: keyframes in, the submap and their poses after it out."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mipsjax.config import Config
+from mipsjax.core import mapping
+from mipsjax.core.camera import Intrinsics
+from mipsjax.data.sequence import Frame
+from mipsjax.state import Keyframe, Pose, rigid
+
+# Purposes of random draws: a draw added in one place moves no other.
+INIT, TRACK, MAP, CHOOSE, FINISH = range(5)
+
+
+def random_key(cfg: Config, purpose: int, number: int) -> jax.Array:
+    """The key of one purpose at one frame."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(cfg.seed), purpose), number)
+
+
+def mapping_stride(camera: Intrinsics, cfg: Config) -> int:
+    """Images are decimated by this for mapping."""
+    return max(1, round(camera.width / cfg.map.width_px))
+
+
+def make_keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camera: Intrinsics) -> Keyframe:
+    """A frame with colour and depth, at mapping size."""
+    assert frame.depth is not None and frame.color is not None
+    every = mapping_stride(camera, cfg)
+    return Keyframe(
+        number, frame.depth[::every, ::every].copy(), frame.color[::every, ::every].copy(), T_sub_cam
+    )
+
+
+def adjust(
+    submap: mapping.Submap,
+    batch: list[Keyframe],
+    rates: list[float],
+    steps: int,
+    number: int,
+    camera: Intrinsics,
+    cfg: Config,
+    rate: float = 1.0,
+) -> tuple[mapping.Submap, list[Pose], bool]:
+    """`mapping.refine` on a batch: shares of the pose rate for each keyframe (0: fixed), of the networks' rate.
+
+    Returns the submap, the poses and whether all stayed finite; if not, nothing has changed.
+    """
+    frames = mapping.Frames(
+        depth=jnp.asarray(np.stack([k.depth for k in batch])),
+        color=jnp.asarray(np.stack([k.color for k in batch])),
+        T_sub_cam=jnp.asarray(np.stack([k.T_sub_cam for k in batch]), jnp.float32),
+        movable=jnp.asarray(np.array(rates, np.float32)),
+    )
+    small = camera.decimated(mapping_stride(camera, cfg))
+    submap, poses, info = mapping.refine(
+        submap, frames, jnp.int32(steps), random_key(cfg, MAP, number), small, cfg, np.float32(rate)
+    )
+    moved = [
+        rigid(pose) if rate else k.T_sub_cam
+        for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)
+    ]
+    return submap, moved, bool(info.ok)

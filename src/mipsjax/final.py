@@ -1,0 +1,60 @@
+"""After the last frame: bundle adjustment over all keyframes, then every frame aligned to the finished map."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from mipsjax.bundle import FINISH, adjust
+from mipsjax.config import Config
+from mipsjax.core import tracking
+from mipsjax.state import THUMBNAIL_UNIT, Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride
+
+BATCH_STEPS = 10  # of mapping on each random batch of keyframes
+ALIGNED = 16  # frames in one call of `tracking.align`
+
+
+def finish(state: SlamState, cfg: Config) -> SlamState:
+    """The state after the last frame: `map.final_steps` steps of mapping, then `track.go.final_steps` of tracking."""
+    state = _adjusted(state, cfg)
+    return _aligned(state, cfg) if cfg.track.go.final_steps and cfg.track.go.method == "lm" else state
+
+
+def _adjusted(state: SlamState, cfg: Config) -> SlamState:
+    """Bundle adjustment at rates that fall to zero; each call takes another random batch, the anchor stays."""
+    calls, keyframes, submap = -(-cfg.map.final_steps // BATCH_STEPS), list(state.keyframes), state.submap
+    for call in range(calls):
+        rng = np.random.default_rng((cfg.seed, FINISH, call))
+        fresh = len(keyframes) < cfg.map.frames
+        chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
+        fall = 1 - call / calls
+        rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
+        batch, number = [keyframes[i] for i in chosen], len(state.records) + call
+        submap, poses, _ = adjust(submap, batch, rates, BATCH_STEPS, number, state.camera, cfg, fall)
+        for i, pose in zip(chosen, poses, strict=True):
+            keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
+    return state._replace(submap=submap, keyframes=tuple(keyframes))
+
+
+def _aligned(state: SlamState, cfg: Config) -> SlamState:
+    """Every trusted frame at the pose where it fits the finished map; the anchor stays."""
+    small = state.camera.decimated(thumbnail_stride(state.camera))
+    records = list(state.records)
+    places = [i for i, record in enumerate(records) if record.depth is not None]
+    for group in (places[i : i + ALIGNED] for i in range(0, len(places), ALIGNED)):
+        filled = [group[i % len(group)] for i in range(ALIGNED)]
+        depth = np.stack([_depth(records[i]) for i in filled])
+        start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
+        poses = np.asarray(tracking.align(state.submap.field, jnp.asarray(depth), start, small, cfg))
+        for i, pose in zip(group, poses, strict=False):
+            records[i] = _moved(records[i], rigid(pose), state.keyframes)
+    return state._replace(records=tuple(records))
+
+
+def _depth(record: Record) -> np.ndarray:
+    assert record.depth is not None
+    return record.depth.astype(np.float32) * np.float32(THUMBNAIL_UNIT)
+
+
+def _moved(record: Record, T_sub_cam: Pose, keyframes: tuple[Keyframe, ...]) -> Record:
+    return record._replace(T_keyframe_cam=np.linalg.inv(keyframes[record.keyframe].T_sub_cam) @ T_sub_cam)
