@@ -25,6 +25,7 @@ from mipsjax.state import SlamState, trajectory
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"
 WARM_UP = 5  # frames after which the clock starts: by then everything is compiled
+EARLY = 200  # frames after which memory is noted, to be compared with the end
 
 
 class Run(NamedTuple):
@@ -34,24 +35,39 @@ class Run(NamedTuple):
 
 
 def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -> Run:
-    """One whole sequence; the row holds the figures every table wants."""
+    """One whole sequence; the row holds the figures every table wants.
+
+    `fps` counts the adjustment after the last frame, `fps_online` does not; `ate_online_cm` is the error before it.
+    """
     cfg = replace(cfg, seed=seed)
     sequence = open_sequence(path, frames=frames, input=cfg.input)
     truth = sequence.T_world_cam
     state = slam.start(sequence[0], sequence.intrinsics, cfg, None if truth is None else truth[0])
-    began = time.perf_counter()
+    began, early = time.perf_counter(), float("nan")
     for position in range(1, len(sequence)):
         if position == WARM_UP:
             began = time.perf_counter()
         state = slam.step(state, sequence[position], cfg)
-    seconds = time.perf_counter() - began
+        if position == EARLY:
+            early = peak_mb()
+    loop_seconds, loop_peak = time.perf_counter() - began, peak_mb()
+    online = state
     state = finish(state, cfg)
+    seconds = time.perf_counter() - began
     row = {"sequence": Path(path).name, "frames": len(sequence), "stride": frames.step or 1, "seed": seed}
-    return Run(state, sequence, row | figures(state, sequence, seconds))
+    if truth is not None:
+        row["ate_online_cm"] = 100 * absolute_error(trajectory(online), truth).rmse_m
+    speed = {
+        "fps": (len(sequence) - WARM_UP) / seconds,
+        "fps_online": (len(sequence) - WARM_UP) / loop_seconds,
+        f"peak_{EARLY}_mb": early,
+        "peak_online_mb": loop_peak,
+    }
+    return Run(state, sequence, row | figures(state, sequence) | speed)
 
 
-def figures(state: SlamState, sequence: Sequence, seconds: float) -> dict[str, Any]:
-    """ATE RMSE after rigid alignment over all frames, RPE over one frame, statuses, speed, memory."""
+def figures(state: SlamState, sequence: Sequence) -> dict[str, Any]:
+    """ATE RMSE after rigid alignment over all frames, RPE over one frame, statuses, times, memory."""
     statuses = Counter(record.status.value for record in state.records)
     timed = [record.info for record in state.records[WARM_UP:]]
     row: dict[str, Any] = {}
@@ -65,12 +81,16 @@ def figures(state: SlamState, sequence: Sequence, seconds: float) -> dict[str, A
         "lost": statuses["lost"] + statuses["skipped"],
         "keyframes": len(state.keyframes),
         "ro_frames": sum(info.searched for info in timed),
-        "fps": (len(sequence) - WARM_UP) / seconds,
         "track_ms": float(np.mean([info.track_ms for info in timed])),
         "map_ms": float(np.mean([info.map_ms for info in timed])),
         "map_bytes": map_bytes(state),
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": peak_mb(),
     }
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def map_bytes(state: SlamState) -> int:
@@ -107,6 +127,6 @@ def show(row: Mapping[str, Any]) -> None:
 
 
 def use_compilation_cache() -> None:
-    """Compile each graph once over all experiments."""
+    """Compile each graph once over all experiments. Set TF_CPP_MIN_LOG_LEVEL=3 against its chatter."""
     jax.config.update("jax_compilation_cache_dir", str(OUT / "cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -88,8 +88,11 @@ class LossConfig:
     emd: float = 0.01
     """Of both distribution terms; the paper gives none, its released code has 0.01."""
     cross_entropy: float = 3.0
-    """Of the two-hot cross entropy in both regions; not in the paper. Its gradient does not vanish where the
+    """Of the two-hot cross entropy in the truncation region; not in the paper. Its gradient does not vanish where the
     distribution is certain and wrong, which the squared terms' does: a new surface is learned in fewer steps."""
+    cross_entropy_free: float = 0.3
+    """The same in free space. With equal weights the free space in front of a new surface pushes it away, which
+    turns the camera a little with every new view."""
     color_samples: int = 3
     """Samples of the truncation region on each ray on which colour is rendered (paper: all)."""
 
@@ -116,7 +119,7 @@ class MapConfig:
     learning_rate: float = 1e-2
     momentum: float = 0.8
     """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
-    pose_learning_rate: float = 2e-3
+    pose_learning_rate: float = 5e-4
     """Of the twist of each frame, metres and radians."""
     pose_rate_slow: float = 0.1
     """Share of that rate where the camera has hardly moved: Adam's first steps are as long as its rate however
@@ -260,7 +263,7 @@ def preset(name: str) -> Config:
 PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
-    loss=LossConfig(cross_entropy=0.0, color_samples=50),
+    loss=LossConfig(cross_entropy=0.0, cross_entropy_free=0.0, color_samples=50),
     map=MapConfig(
         steps=15,
         steps_slow=15,

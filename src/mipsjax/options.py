@@ -75,6 +75,7 @@ RANGES: dict[str, Range] = {
     "loss.rgb": NOT_NEGATIVE,
     "loss.emd": NOT_NEGATIVE,
     "loss.cross_entropy": NOT_NEGATIVE,
+    "loss.cross_entropy_free": NOT_NEGATIVE,
     "loss.color_samples": COUNT,
     "map.steps": NOT_NEGATIVE,
     "map.steps_slow": NOT_NEGATIVE,

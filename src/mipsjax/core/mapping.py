@@ -164,11 +164,13 @@ def map_loss(
 def tsdf_loss(prediction: nf.Tsdf, samples: sampling.Samples, cfg: Config) -> Float[Array, ""]:
     target = samples.target.reshape(-1)
     total = jnp.zeros(())
-    for weight, mask in ((cfg.loss.tr, samples.near), (cfg.loss.fs, samples.free)):
+    near = (cfg.loss.tr, cfg.loss.cross_entropy, samples.near)
+    free = (cfg.loss.fs, cfg.loss.cross_entropy_free, samples.free)
+    for squared, entropy, mask in (near, free):
         flat = mask.reshape(-1)
-        total += weight * losses.distance(prediction.psi, target, flat)
+        total += squared * losses.distance(prediction.psi, target, flat)
         total += cfg.loss.emd * losses.emd(prediction, target, flat, cfg.field)
-        total += cfg.loss.cross_entropy * losses.cross_entropy(prediction, target, flat, cfg.field)
+        total += entropy * losses.cross_entropy(prediction, target, flat, cfg.field)
     return total
 
 
