@@ -14,7 +14,9 @@ images nor meshes:
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -75,10 +77,26 @@ _PLACES = {
 }
 
 
+# Their fusions with the YNN library read freed memory on CPUs (jax issue 39257): a pose comes out wrong, NaN, or
+# the process dies. The requirements exclude them; this is for environments put together otherwise.
+_BROKEN_JAXLIB = ("0.10.2", "0.11.0")
+_WITHOUT_YNN = "--xla_cpu_experimental_ynn_fusion_type="
+
+
+def _check_jaxlib(found: str, flags: str) -> None:
+    """Raises ImportError where this jaxlib computes wrong derivatives."""
+    if found in _BROKEN_JAXLIB and _WITHOUT_YNN not in flags.split():
+        raise ImportError(
+            f"jaxlib {found} computes wrong results on CPUs (jax issue 39257): install another version, "
+            f"or set XLA_FLAGS={_WITHOUT_YNN}"
+        )
+
+
+_check_jaxlib(version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
+
+
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib.metadata import version
-
         return version("mipsjax")
     if name not in _PLACES:
         raise AttributeError(f"module 'mipsjax' has no attribute '{name}'")

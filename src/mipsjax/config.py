@@ -285,6 +285,7 @@ TINY = Config(
         hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
     ),
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
+    loss=LossConfig(cross_entropy_free=3.0),
     map=MapConfig(pose_learning_rate=1e-3, steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
