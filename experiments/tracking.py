@@ -12,13 +12,13 @@ import argparse
 from typing import Any
 
 from common import DATA, changed, run, show, use_compilation_cache, write_rows
-from mipsjax.config import Config
+from mipsjax.config import Config, preset
 
 SYNTH = ("room-fast", "room-fast+noise+blur")
 
 
-def kitchen(stride: int, seed: int, cfg: Config) -> dict[str, Any]:
-    return run(str(DATA / "redkitchen"), cfg, frames=slice(0, 1000, stride), seed=seed).row
+def kitchen(stride: int, seed: int, cfg: Config, stop: int = 1000) -> dict[str, Any]:
+    return run(str(DATA / "redkitchen"), cfg, frames=slice(0, stop, stride), seed=seed).row
 
 
 def main() -> None:
@@ -29,9 +29,12 @@ def main() -> None:
     parser.add_argument("--strides", type=int, nargs="*", default=[1, 4, 8, 16])
     parser.add_argument("--without-ro", action="store_true", help="also the fastest stride without RO")
     parser.add_argument("--synth", action="store_true", help="also the fast synthetic room")
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--stop", type=int, default=1000, help="frames of the kitchen")
     parser.add_argument("--name", default="tracking", help="of the table")
     options = parser.parse_args()
     use_compilation_cache()
+    cfg = preset(options.preset)
     rows = []
 
     def add(name: str, row: dict[str, Any]) -> None:
@@ -41,11 +44,11 @@ def main() -> None:
 
     for seed in options.seeds:
         for stride in sorted(options.strides, reverse=True):
-            add("default", kitchen(stride, seed, Config()))
+            add(options.preset, kitchen(stride, seed, cfg, options.stop))
         if options.without_ro:
-            add("no RO", kitchen(max(options.strides), seed, changed(Config(), "track.ro", when="never")))
+            add("no RO", kitchen(max(options.strides), seed, changed(cfg, "track.ro", when="never")))
         for name in SYNTH if options.synth else ():
-            add("default", run(f"synth:{name}", Config(), seed=seed).row)
+            add(options.preset, run(f"synth:{name}", cfg, seed=seed).row)
 
 
 if __name__ == "__main__":

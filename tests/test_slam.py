@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from mipsjax import slam
 from mipsjax.config import PRESETS, InputConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
+from mipsjax.final import finish
 from mipsjax.policy import Status
 from mipsjax.state import SlamState, trajectory
 
@@ -137,6 +140,29 @@ def test_tracking_goes_on_after_a_lost_frame(finished, frames):
     lost = slam.step(finished, garbage(frames[-1]), CFG)
     after = slam.step(lost, following(frames[-1])._replace(timestamp=frames[-1].timestamp + 2 / 30), CFG)
     assert after.records[-1].status is Status.OK and after.trouble == 0
+
+
+def test_finish_aligns_every_trusted_frame_to_the_map(finished, frames):
+    """A frame pushed off by 2 cm comes back; the anchor and a frame without depth stay with their keyframe."""
+    cfg = replace(CFG, map=replace(CFG.map, final_steps=0))
+    state = slam.step(finished, following(frames[-1])._replace(depth=None, problem="gone"), CFG)
+    off = state.records[3].T_keyframe_cam.copy()
+    off[:3, 3] += 0.02 / np.sqrt(3)
+    records = list(state.records)
+    records[3] = records[3]._replace(T_keyframe_cam=off)
+    after = finish(state._replace(records=tuple(records)), cfg)
+    moved = np.linalg.norm(trajectory(after)[:, :3, 3] - trajectory(state)[:, :3, 3], axis=1)
+    # The pose before was found with other pixels of a coarse map
+    assert moved[3] < 0.01
+    assert moved[0] == 0 and moved[-1] == 0
+    assert same_map(after, state)
+
+
+def test_finish_without_steps_changes_nothing(finished):
+    cfg = replace(CFG, map=replace(CFG.map, final_steps=0))
+    go = replace(cfg.track.go, final_steps=0)
+    after = finish(finished, replace(cfg, track=replace(cfg.track, go=go)))
+    np.testing.assert_array_equal(trajectory(after), trajectory(finished))
 
 
 def test_states_are_values(finished, frames):
