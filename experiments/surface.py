@@ -19,7 +19,7 @@ from common import OUT, Run, run, show, use_compilation_cache, write_rows
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth.mesh import reference_mesh
-from mipsjax.host.render import save_picture
+from mipsjax.host.picture import save_picture
 from mipsjax.host.surface import Views, compare_meshes
 from mipsjax.reconstruct import reconstruct
 

@@ -16,7 +16,7 @@ ROOT = Path(mipsjax.__file__).parent
 
 # From the left; a module imports only from layers before its own, and from its own package.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "config"}),
+    frozenset({"errors", "config", "files"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
     frozenset({"state"}),
@@ -29,6 +29,7 @@ LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
 
 # Imports between neighbours of one layer that are meant. No cycle may come of them (tested below).
 NEIGHBOURS = {
+    ("files", "errors"),  # a file that cannot be written raises OutputError
     ("config", "errors"),  # validation raises ConfigError
     ("commandline", "options"),  # the command line is one source of options beside files and presets
     ("outputs", "options"),  # config.json holds the resolved options

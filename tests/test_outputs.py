@@ -21,7 +21,7 @@ from mipsjax.core import mapping
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import OutputError
-from mipsjax.host.render import write_atomically
+from mipsjax.files import write_atomically
 from mipsjax.policy import Status
 from mipsjax.reconstruct import observed_points, reconstruct
 from mipsjax.state import FrameInfo, Record, SlamState

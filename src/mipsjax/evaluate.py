@@ -20,8 +20,8 @@ from mipsjax.data.association import associate, sort_stamps
 from mipsjax.data.textfile import content_lines
 from mipsjax.data.trajectory import Trajectory, read_matrix_rows, read_tum
 from mipsjax.errors import ConfigError, InputError, MipsjaxError
+from mipsjax.files import write_atomically
 from mipsjax.host import metrics, surface
-from mipsjax.host.render import write_atomically
 
 MATRIX_COLUMNS = 16
 """Numbers in a row of a file of 4 x 4 matrices; a TUM row has 8."""

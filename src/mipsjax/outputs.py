@@ -26,8 +26,9 @@ from mipsjax.config import Config
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.trajectory import write_tum
 from mipsjax.errors import OutputError
+from mipsjax.files import write_atomically
 from mipsjax.host.meshing import export_ply
-from mipsjax.host.render import save_picture, up_direction, write_atomically
+from mipsjax.host.picture import save_picture, up_direction
 from mipsjax.options import to_dict
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, trajectory

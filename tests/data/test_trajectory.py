@@ -71,7 +71,7 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_writing_to_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot write"):
         write_tum(tmp_path / "none" / "t.txt", np.zeros(1), np.eye(4)[None])
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mipsjax.core.camera import Intrinsics
 from mipsjax.errors import OutputError
-from mipsjax.host import render
+from mipsjax.host import picture, render
 
 CAMERA = Intrinsics(70.3, 71.9, 39.2, 30.7, 80, 60)
 FLOAT32 = 1e-6
@@ -87,7 +87,7 @@ def test_an_empty_mesh_is_background():
     empty = trimesh.Trimesh()
     seen = render.render_mesh(empty, np.eye(4), CAMERA)
     assert not seen.depth.any() and (seen.color == 255).all()
-    assert (render.picture(empty, (40, 30)) == 255).all()
+    assert (picture.picture(empty, (40, 30)) == 255).all()
 
 
 def test_degenerate_triangles_do_no_harm():
@@ -100,9 +100,9 @@ def test_degenerate_triangles_do_no_harm():
 def test_up_is_against_the_cameras_down():
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, :3, :3] = Rotation.from_euler("x", [[-100], [-80], [-90]], degrees=True).as_matrix()
-    up = render.up_direction(np.concatenate([T, np.full((1, 4, 4), np.nan)]))
+    up = picture.up_direction(np.concatenate([T, np.full((1, 4, 4), np.nan)]))
     np.testing.assert_allclose(up, -T[2, :3, 1], atol=1e-9)
-    np.testing.assert_array_equal(render.up_direction(np.full((2, 4, 4), np.nan)), [0, -1, 0])
+    np.testing.assert_array_equal(picture.up_direction(np.full((2, 4, 4), np.nan)), [0, -1, 0])
 
 
 def room():
@@ -119,12 +119,12 @@ def room():
 
 def test_level_turns_up_to_the_floors_normal():
     tilted = Rotation.from_rotvec([0.2, -0.1, 0.0]).apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(render.level(room(), tilted), [0, 0, 1], atol=1e-9)
-    np.testing.assert_allclose(render.level(room(), -tilted), [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(picture.level(room(), tilted), [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(picture.level(room(), -tilted), [0, 0, -1], atol=1e-9)
 
 
 def test_one_looks_into_a_closed_room():
-    image = render.picture(room(), (160, 120), np.array([0.05, 0.02, 1.0]))
+    image = picture.picture(room(), (160, 120), np.array([0.05, 0.02, 1.0]))
     assert image.shape == (120, 160, 3) and image.dtype == np.uint8
     red = (image[..., 0] > 2 * image[..., 1].astype(int)).mean()
     grey = ((image[..., 0] == image[..., 1]) & (image[..., 0] < 200)).mean()
@@ -134,13 +134,13 @@ def test_one_looks_into_a_closed_room():
 
 
 def test_a_closed_room_seen_upside_down_shows_the_ceiling():
-    image = render.picture(room(), (160, 120), np.array([0.0, 0.0, -1.0]))
+    image = picture.picture(room(), (160, 120), np.array([0.0, 0.0, -1.0]))
     assert not (image[..., 0] > 2 * image[..., 1].astype(int)).any()
 
 
 def test_saved_picture_is_a_png_of_the_same_pixels(tmp_path):
-    render.save_picture(tmp_path / "room.png", room(), np.array([0.0, 0.0, 1.0]), (80, 60))
+    picture.save_picture(tmp_path / "room.png", room(), np.array([0.0, 0.0, 1.0]), (80, 60))
     read = cv2.imread(str(tmp_path / "room.png"))[..., ::-1]
-    np.testing.assert_array_equal(read, render.picture(room(), (80, 60), np.array([0.0, 0.0, 1.0])))
+    np.testing.assert_array_equal(read, picture.picture(room(), (80, 60), np.array([0.0, 0.0, 1.0])))
     with pytest.raises(OutputError, match="cannot write"):
-        render.save_picture(tmp_path / "missing" / "room.png", room(), size=(8, 6))
+        picture.save_picture(tmp_path / "missing" / "room.png", room(), size=(8, 6))

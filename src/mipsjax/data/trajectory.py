@@ -6,7 +6,6 @@ files. A pose that is unknown is a matrix of NaN.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,8 @@ from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from mipsjax.data.textfile import read_number_block, read_number_rows
-from mipsjax.errors import InputError, OutputError
+from mipsjax.errors import InputError
+from mipsjax.files import write_atomically
 
 MAX_STRETCH = 0.1
 """How far the singular values of a rotation may be from 1. Published poses are off by up to 1e-3; a scaled
@@ -153,21 +153,7 @@ def write_tum(
         f"{time:.6f} " + " ".join(f"{value:.9f}" for value in row)
         for time, row in zip(timestamps[known], values, strict=True)
     ]
-    _replace_text(path, "\n".join([_TUM_HEADER, *rows]) + "\n")
-
-
-def _replace_text(path: Path, text: str) -> None:
-    """Writes beside `path` and renames, after the data has reached the disk."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("w", encoding="ascii", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    write_atomically(path, ("\n".join([_TUM_HEADER, *rows]) + "\n").encode())
 
 
 def _remarks(finite: Bool[np.ndarray, "N"], rigid: Bool[np.ndarray, "N"], source: str) -> tuple[str, ...]:

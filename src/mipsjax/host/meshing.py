@@ -24,7 +24,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
-from mipsjax.host.render import vertex_colors, write_atomically
+from mipsjax.files import write_atomically
+from mipsjax.host.render import vertex_colors
 
 log = logging.getLogger(__name__)
 
