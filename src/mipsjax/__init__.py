@@ -92,6 +92,10 @@ def _check_jaxlib(found: str, flags: str) -> None:
         )
 
 
+# jaxlib says of each program that it reads from its own compilation cache, in kilobytes and as an error, that it may
+# not fit the processor, although it does. Errors that matter are raised.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 _check_jaxlib(version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
 
 
