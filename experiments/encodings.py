@@ -1,6 +1,6 @@
-"""The encodings beside each other: sinusoids, hash grid, and both (search on the smooth field, refinement on the fine).
+"""The encodings beside each other: sinusoids, hash grid, one network fed with both, and both side by side.
 
-    python experiments/encodings.py [--encodings frequency hash both] [--seeds 0] [--strides 4 8 16]
+    python experiments/encodings.py [--encodings frequency hash joint both] [--seeds 0] [--strides 4 8 16]
 
 Each with everything else as in the default. Writes `encodings.csv`: a row a run, ATE RMSE after rigid alignment.
 The basin of each is measured by `basin.py --encodings ...`, the surface by this script's rows on `synth:room`.
@@ -22,7 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--encodings", nargs="*", default=["frequency", "hash", "both"])
+    parser.add_argument("--encodings", nargs="*", default=["frequency", "hash", "joint", "both"])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--strides", type=int, nargs="*", default=[4, 8, 16])
     options = parser.parse_args()

@@ -11,7 +11,7 @@ from typing import Literal
 
 from mipsjax.errors import ConfigError
 
-Encoding = Literal["frequency", "hash", "both"]
+Encoding = Literal["frequency", "hash", "joint", "both"]
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class FieldConfig:
     """One submap's networks."""
 
     encoding: Encoding = "both"
-    """`frequency`: sinusoids and one network, as in the paper; `hash`: a multiresolution hash grid; `both`: a
-    smooth sinusoidal field for the search and a hash-grid field for the refinement, learned side by side."""
+    """`frequency`: sinusoids and one network, as in the paper; `hash`: a multiresolution hash grid; `joint`: one
+    network fed with both; `both`: a smooth sinusoidal field for the search and a hash-grid field for the
+    refinement, learned side by side."""
     truncation: float = 0.1
     """Metres, the paper's tau."""
     classification: bool = True

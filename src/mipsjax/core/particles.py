@@ -18,8 +18,8 @@ from mipsjax.config import FieldConfig, SearchConfig
 from mipsjax.core import field as nf
 from mipsjax.core import losses
 
-# Poses per chunk of the fitness: keeps the activations of one chunk in the processor's cache.
-CHUNK_POINTS = 8192
+# Points per chunk of the fitness: the activations stay in cache, and starting the threads costs little.
+CHUNK_POINTS = 32768
 
 
 class Swarm(NamedTuple):
