@@ -55,7 +55,7 @@ RANGES: dict[str, Range] = {
     "field.truncation": POSITIVE,
     "field.classes": Range(2, 64),
     "field.coldness": POSITIVE,
-    # The double-angle recurrence loses a bit an octave: single precision has 24
+    # Rounding of the angle loses a bit an octave: single precision has 24
     "field.octaves": Range(1, 16),
     "field.longest_wavelength": POSITIVE,
     "field.hidden": COUNT,
