@@ -221,6 +221,64 @@ class TrackConfig:
 
 
 @dataclass(frozen=True)
+class VolumeConfig:
+    """The box that a submap governs, and when another submap takes over."""
+
+    governs: Literal["frustum", "depth", "surface"] = "depth"
+    """What of a keyframe the box encloses. `frustum`: the viewing frustum up to `far`, as in the paper; in a small
+    room it reaches through walls. `depth`: the same, cut at the measured depth of each pixel. `surface`: measured
+    points nearer than `far` only, so that a box has no share of the empty space in front of them."""
+    far: float = 5.0
+    """Metres, the far clipping plane of the frustum."""
+    max_side: float = 7.0
+    """Metres; a side of the box grows up to this length."""
+    overlap: float = 0.75
+    """Where a smaller share of what a keyframe sees is in the box, a new submap begins."""
+    hysteresis: float = 0.1
+    """Another submap takes over where it holds this much more of the view than the active one (paper: none given).
+    Without it two submaps of about the same overlap take turns."""
+    margin: float = 0.1
+    """Metres added to the box beyond what a keyframe sees; not in the paper. As the truncation, so that the region
+    behind a wall in which its distance is learned belongs to the box."""
+
+
+@dataclass(frozen=True)
+class CorrespondConfig:
+    """Pairs of surface points of two submaps."""
+
+    points: int = 2048
+    """Surface points of a submap; fewer are masked, more are thinned out."""
+    newton_steps: int = 4
+    """From measured points onto the zero level set."""
+    match_steps: int = 3
+    """From a point to the surface of the other submap; Eq. 19 is one step, which ends up to 2 cm off."""
+    max_distance: float = 0.005
+    """Metres; a point with a larger distance after these steps is not on the surface."""
+    max_entropy: float = 0.8
+    """Share of the entropy of an even class distribution; less certain points are left out."""
+    min_gradient: float = 0.2
+    """Least norm of the gradient on a surface. It is 1 for a true distance, commonly 0.4 to 1 for a classified one
+    (core/correspond.py), and about 0 where nothing was learned."""
+    max_gradient: float = 3.0
+    """Largest such norm: a distance along rays rises faster than that across a slanted surface."""
+    max_angle: float = 0.6
+    """Radians between the normals of a pair; across a larger angle they are on different surfaces, as the two sides
+    of a thin wall are."""
+
+
+@dataclass(frozen=True)
+class BlendConfig:
+    """The distance over several submaps (Eq. 1)."""
+
+    entropy_floor: float = 0.3
+    """Nats; bounds the weight 1 / h^2 of a certain point."""
+    fade: float = 0.05
+    """Metres inside the faces of a box over which the weight of its submap falls to zero, so that there is no step
+    where a submap ends within another; 0 is none, as in the paper. At most `volume.margin`, or measured surface
+    near a face has little weight."""
+
+
+@dataclass(frozen=True)
 class MeshConfig:
     """The surface that is written at the end."""
 
@@ -251,6 +309,9 @@ class Config:
     track: TrackConfig = TrackConfig()
     keyframe: KeyframeConfig = KeyframeConfig()
     guard: GuardConfig = GuardConfig()
+    volume: VolumeConfig = VolumeConfig()
+    correspond: CorrespondConfig = CorrespondConfig()
+    blend: BlendConfig = BlendConfig()
     mesh: MeshConfig = MeshConfig()
     seed: int = 0
 
@@ -281,6 +342,8 @@ PAPER = Config(
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False),
     ),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
+    volume=VolumeConfig(governs="frustum", hysteresis=0.0, margin=0.0),
+    blend=BlendConfig(fade=0.0),
 )
 TINY = Config(
     field=FieldConfig(

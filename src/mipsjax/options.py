@@ -46,6 +46,8 @@ SMALLEST_IMAGE = 16
 """Pixels; narrower images hold no scene."""
 LARGEST_SEED = 2**32 - 1
 """Seeds are 32 bits."""
+RIGHT_ANGLE = math.pi / 2
+"""Radians; the surfaces of two normals farther apart face away from each other."""
 
 RANGES: dict[str, Range] = {
     "input.depth_min": NOT_NEGATIVE,
@@ -117,6 +119,21 @@ RANGES: dict[str, Range] = {
     "keyframe.rotation": SWITCH,
     "guard.weak": SHARE,
     "guard.lost": SHARE,
+    "volume.far": POSITIVE,
+    "volume.max_side": POSITIVE,
+    "volume.overlap": SHARE,
+    "volume.hysteresis": SHARE,
+    "volume.margin": NOT_NEGATIVE,
+    "correspond.points": COUNT,
+    "correspond.newton_steps": COUNT,
+    "correspond.match_steps": COUNT,
+    "correspond.max_distance": POSITIVE,
+    "correspond.max_entropy": Range(0.0, 1.0, above=True),
+    "correspond.min_gradient": POSITIVE,
+    "correspond.max_gradient": POSITIVE,
+    "correspond.max_angle": Range(0.0, RIGHT_ANGLE, above=True),
+    "blend.entropy_floor": POSITIVE,
+    "blend.fade": NOT_NEGATIVE,
     "mesh.voxel": Range(1e-3),
     "mesh.margin": POSITIVE,
     "mesh.band": POSITIVE,
@@ -131,6 +148,7 @@ NOT_BELOW = (
     ("field.hash_coarsest", "field.hash_finest"),
     ("field.truncation", "mesh.band"),
     ("guard.weak", "guard.lost"),
+    ("correspond.max_gradient", "correspond.min_gradient"),
 )
 """Pairs whose first field must not be below the second."""
 

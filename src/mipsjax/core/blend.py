@@ -1,0 +1,85 @@
+"""The distance and the colour over any number of submaps (Eq. 1 of the paper).
+
+`start`, then `add` for each submap in any order: after each the blend is that of the submaps so far. A submap's
+parameters, pose and box are arguments like any other, so that one compilation serves any number of them.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mipsjax.config import Config, FieldConfig
+from mipsjax.core import field as nf
+from mipsjax.core import losses
+from mipsjax.core.camera import transform
+
+STEP = 1e-6  # metres; a fade as short as this is none
+
+
+class Blended(NamedTuple):
+    """What is known at N points from the submaps added so far: means, each submap weighted by its certainty."""
+
+    psi: Float[Array, " N"]
+    """Truncated signed distance, metres; the truncation (free space) where no submap reaches."""
+    entropy: Float[Array, " N"]
+    """Nats; that of an even distribution where no submap reaches."""
+    color: Float[Array, "N 3"]
+    """RGB in 0..1; black where no submap reaches."""
+    weight: Float[Array, " N"]
+    """Sum of the submaps' weights, each at most 1; 0 where no submap reaches."""
+
+
+def start(points: int, cfg: FieldConfig) -> Blended:
+    """`points` points before any submap: free space, of which nothing is known."""
+    psi, entropy = jnp.full(points, cfg.truncation), jnp.full(points, np.log(cfg.classes), jnp.float32)
+    return Blended(psi, entropy, jnp.zeros((points, 3)), jnp.zeros(points))
+
+
+@partial(jax.jit, static_argnames=("cfg", "colored"))
+def add(
+    total: Blended,
+    field: nf.Field,
+    T_sub_world: Float[Array, "4 4"],
+    lo: Float[Array, "3"],
+    hi: Float[Array, "3"],
+    p_world: Float[Array, "N 3"],
+    cfg: Config,
+    colored: bool = True,
+) -> Blended:
+    """The blend with one more submap, whose box is `lo` to `hi` in its own frame, metres.
+
+    Its weight is 1 / h^2, bounded as in tracking, and nothing outside its box. The means are running ones: a
+    submap alone gives its own values exactly. Points where a submap is not finite are left to the others.
+    Without `colored` the colour stays as it is, for less work.
+    """
+    p_sub = transform(T_sub_world, p_world)
+    encoded = nf.encode(field, p_sub, cfg.field)
+    net = field.smooth if field.fine is None else field.fine
+    assert net is not None
+    psi, entropy, _ = nf.classify(net, encoded, cfg.field)
+    weight = losses.certainty(entropy, cfg.blend.entropy_floor) * fading(p_sub, lo, hi, cfg.blend.fade)
+    used = (weight > 0) & jnp.isfinite(psi)
+    together = total.weight + jnp.where(used, weight, 0.0)
+    share = jnp.where(used, weight / jnp.where(used, together, 1.0), 0.0)
+
+    def mean(old, new):
+        by = share.reshape(-1, *[1] * (old.ndim - 1))
+        return jnp.where(by > 0, (1 - by) * old + by * new, old)
+
+    color = mean(total.color, nf.decode_color(field, encoded)) if colored else total.color
+    return Blended(mean(total.psi, psi), mean(total.entropy, entropy), color, together)
+
+
+def fading(
+    p_sub: Float[Array, "N 3"], lo: Float[Array, "3"], hi: Float[Array, "3"], fade: float
+) -> Float[Array, " N"]:
+    """1 in a box, 0 outside, with a smooth fall over `fade` metres inside its faces; 0 for NaN."""
+    depth_inside = jnp.min(jnp.minimum(p_sub - lo[None], hi[None] - p_sub), -1)
+    t = jnp.clip(depth_inside / max(fade, STEP), 0, 1)
+    return jnp.where(depth_inside > 0, t * t * (3 - 2 * t), 0.0)

@@ -1,0 +1,130 @@
+"""The box that a submap governs: what a keyframe sees, growth, containment and overlap.
+
+Plain NumPy in double precision: it runs on the host, a few times a frame, with some hundred points. Boxes and
+points are in a submap's frame, metres; a box is closed, so that a point on a face is inside.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from mipsjax.config import VolumeConfig
+from mipsjax.core.camera import Intrinsics
+
+ROWS, COLUMNS = 12, 16
+"""Pixels of an image whose rays stand for it: a step of about 4 degrees for a common depth camera."""
+DEPTHS = 8
+"""Points on a ray: about 60 cm apart up to 5 m, a tenth of the largest box."""
+CELLS = 8
+"""Along each side of a box whose volume is compared: a share of it is known to about a hundredth."""
+
+
+class Box(NamedTuple):
+    """An axis-aligned box in a submap's frame (Omega of the paper)."""
+
+    lo: Float64[np.ndarray, "3"]
+    """Metres."""
+    hi: Float64[np.ndarray, "3"]
+
+
+class Seen(NamedTuple):
+    """Points that stand for what a frame sees; as many for every frame of one camera and config."""
+
+    p_cam: Float64[np.ndarray, "M 3"]
+    mask: Bool[np.ndarray, " M"]
+
+
+def seen(depth: Float[np.ndarray, "h w"], camera: Intrinsics, cfg: VolumeConfig) -> Seen:
+    """What a frame sees, by one of three definitions (`cfg.governs`). Camera frame, metres.
+
+    An even grid of pixels from edge to edge, and on the ray of each:
+
+    - `frustum`: even depths up to `far`, whatever was measured there (Section 3.4 of the paper);
+    - `depth`: even depths up to the measured one, or to `far` where that is nearer;
+    - `surface`: the measured point, where it is nearer than `far`; its row of depths collapses to one.
+
+    Pixels without a measurement are masked, except by `frustum`. Depths are even, not volumes: what is near, and
+    seen in most detail, counts as much as what is far.
+    """
+    v, u = (grid.ravel() for grid in np.meshgrid(*_grid(camera), indexing="ij"))
+    measured = depth[v, u].astype(np.float64)
+    valid = np.isfinite(measured) & (measured > 0)
+    measured = np.where(valid, measured, 0.0)
+    even = np.arange(1, DEPTHS + 1) / DEPTHS
+    if cfg.governs == "frustum":
+        reach, valid = np.full_like(measured, cfg.far), np.ones_like(valid)
+    elif cfg.governs == "depth":
+        reach = np.minimum(measured, cfg.far)
+    else:
+        reach, valid, even = measured, valid & (measured < cfg.far), np.ones(1)
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], -1)
+    p_cam = ray[:, None] * (reach[:, None] * even)[..., None]
+    return Seen(p_cam.reshape(-1, 3), np.repeat(valid, len(even)))
+
+
+def moved(T_a_b: Float64[np.ndarray, "4 4"], p_b: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
+    """Points from frame b to frame a, in double precision."""
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def grow(
+    box: Box | None, points: Float64[np.ndarray, "M 3"], mask: Bool[np.ndarray, " M"], cfg: VolumeConfig
+) -> Box:
+    """The least expansion that encloses the points and a margin, within `max_side` (Section 3.4 of the paper).
+
+    A side that would become longer grows to exactly `max_side`, towards where it is needed; where both ends are,
+    each gets its share of what is left. A first box (None) grows in this way from the place nearest to the
+    submap's origin, where the anchor camera stands. Without points a box stays as it is, and a first one is
+    that origin. Points that are not finite count as masked.
+    """
+    points = _usable(points, mask)
+    if len(points) == 0:
+        return Box(np.zeros(3), np.zeros(3)) if box is None else box
+    needed = Box(points.min(0) - cfg.margin, points.max(0) + cfg.margin)
+    if box is None:
+        nearest = np.clip(np.zeros(3), *needed)
+        box = Box(nearest, nearest)
+    below, above = np.maximum(box.lo - needed.lo, 0), np.maximum(needed.hi - box.hi, 0)
+    wanted, free = below + above, np.maximum(cfg.max_side - (box.hi - box.lo), 0)
+    fits = wanted <= free
+    share = free / np.where(fits, 1, wanted)
+    # Where all of it fits, the bounds are taken over exactly: the points on them are inside, not just outside
+    lo = np.where(fits, np.minimum(box.lo, needed.lo), box.lo - share * below)
+    hi = np.where(fits, np.maximum(box.hi, needed.hi), box.hi + share * above)
+    return Box(lo, hi)
+
+
+def inside(box: Box, points: Float64[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
+    """Which points are in the box; faces belong to it, NaN is outside."""
+    return np.all((points >= box.lo) & (points <= box.hi), axis=-1)
+
+
+def contained(box: Box, points: Float64[np.ndarray, "M 3"], mask: Bool[np.ndarray, " M"]) -> float:
+    """Share of the points in the box, 0..1. Points that are not finite count as masked.
+
+    1 where no point is left: a frame that sees nothing is no reason for a new submap.
+    """
+    points = _usable(points, mask)
+    return float(inside(box, points).mean()) if len(points) else 1.0
+
+
+def boxes_overlap(box_a: Box, T_a_b: Float64[np.ndarray, "4 4"], box_b: Box) -> float:
+    """Share of box b's volume that is in box a, 0..1, by the centres of `CELLS`^3 equal cells of b."""
+    even = (np.arange(CELLS) + 0.5) / CELLS
+    unit = np.stack(np.meshgrid(even, even, even, indexing="ij"), -1).reshape(-1, 3)
+    return float(inside(box_a, moved(T_a_b, box_b.lo + unit * (box_b.hi - box_b.lo))).mean())
+
+
+def _grid(camera: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of an even grid with the image's edges in it."""
+    return tuple(  # pyright: ignore[reportReturnType]  (of two elements)
+        np.rint(np.linspace(0, size - 1, count)).astype(int)
+        for size, count in ((camera.height, ROWS), (camera.width, COLUMNS))
+    )
+
+
+def _usable(points: Float64[np.ndarray, "M 3"], mask: Bool[np.ndarray, " M"]) -> Float64[np.ndarray, "K 3"]:
+    return points[mask & np.isfinite(points).all(-1)]
