@@ -241,7 +241,8 @@ def test_depth_in_view_is_that_of_a_room(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(SPECS))
 def test_path_is_long_enough_for_its_frames(name: str) -> None:
-    assert (SPECS[name].frames - 1) / FPS <= SPECS[name].path().duration
+    path = SPECS[name].path()
+    assert path.closed or (SPECS[name].frames - 1) / FPS <= path.duration
 
 
 def test_slow_path_comes_back() -> None:

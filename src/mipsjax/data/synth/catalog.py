@@ -9,9 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mipsjax.core.camera import Intrinsics
+from mipsjax.data.synth.apartment import WALK, apartment
+from mipsjax.data.synth.corridors import RING, STAIR, corridor_loop, winding_corridor
 from mipsjax.data.synth.path import CameraPath, SpeedLimits, spline_path
 from mipsjax.data.synth.rooms import living_room
 from mipsjax.data.synth.scene import Scene
+from mipsjax.data.synth.walk import Gait, walk
 
 FPS = 30.0
 """Frames a second of every sequence."""
@@ -76,8 +79,48 @@ def _around(
     return places, targets
 
 
+@lru_cache(maxsize=1)
+def _apartment() -> CameraPath:
+    """Through all rooms at walking speed, looking about."""
+    gait = Gait(corner=0.35, ahead=2.2, look_aside=1.1, look_every=6.0)
+    limits = SpeedLimits(linear=(0.5, 0.8), angular=(0.0, np.radians(40.0)))
+    places, targets = walk(WALK, gait, closed=True)
+    return spline_path(places, targets, limits, lambda s: np.full_like(s, 0.75), closed=True, roll_deg=1.0)
+
+
+@lru_cache(maxsize=1)
+def _corridor_loop() -> CameraPath:
+    """Once round at a brisk walk, looking from wall to wall."""
+    places, targets = walk(RING, _IN_CORRIDORS, closed=True)
+    return spline_path(places, targets, _BRISK, lambda s: np.full_like(s, 1.3), closed=True, roll_deg=1.0)
+
+
+@lru_cache(maxsize=1)
+def _no_loop() -> CameraPath:
+    """From one end to 2 m before the other."""
+    stop = (STAIR[-1][0] - 2.0, STAIR[-1][1])
+    places, targets = walk((*STAIR[:-1], stop), _IN_CORRIDORS, closed=False)
+    return spline_path(places, targets, _BRISK, lambda s: np.full_like(s, 1.2), closed=False, roll_deg=1.0)
+
+
+_IN_CORRIDORS = Gait(corner=0.6, ahead=2.4, look_aside=0.9, look_every=7.0)
+_BRISK = SpeedLimits(linear=(0.9, 1.5), angular=(0.0, np.radians(60.0)))
+
 SPECS: dict[str, Spec] = {
     "room": Spec(living_room, _room_slow, QVGA, 480, "living room, slow: 0.3 m/s, once round"),
     "room-fast": Spec(living_room, _room_fast, QVGA, 200, "living room, 1 to 4 m/s, twice round"),
     "tiny": Spec(living_room, _room_slow, QVGA.resized(80, 60), 16, "living room, 16 frames of 80 x 60"),
+    "apartment": Spec(
+        apartment, _apartment, QVGA, 1370, "six rooms, 16 x 12 m, walking: 0.75 m/s, through all and back"
+    ),
+    "corridor-loop": Spec(
+        corridor_loop, _corridor_loop, QVGA, 1590, "ring of corridors, 64 m, 1.3 m/s, once round and 4 m more"
+    ),
+    "no-loop": Spec(
+        winding_corridor,
+        _no_loop,
+        QVGA,
+        1040,
+        "corridor of four legs that look alike, 42 m, 1.2 m/s, no return",
+    ),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +12,14 @@ import trimesh
 from jaxtyping import Array, Float, Float32, Float64, Int
 from skimage.measure import marching_cubes
 
+from mipsjax.data.synth.cull import is_large, nearby
 from mipsjax.data.synth.render import display, radiance
 from mipsjax.data.synth.scene import Scene
 
 # Cells along the side of a block: small enough that most blocks hold no surface and are skipped
 _BLOCK_CELLS = 20
+# Side in metres of the squares on the floor around which the shapes of a large scene are gathered
+_PART_M = 1.5
 # Points evaluated in one compiled call
 _CHUNK = 65536
 # Vertices nearer than this share of a voxel are one: neighbouring blocks agree to rounding only
@@ -34,7 +38,11 @@ def reference_mesh(scene: Scene, voxel_m: float = 0.01) -> trimesh.Trimesh:
     """
     # A cell and a half outside, so that no wall along the axes lies in a plane of the grid
     low = np.asarray(scene.bounds, np.float64)[0] - 1.5 * voxel_m
-    pieces = [_mesh_block(scene, low, first, voxel_m) for first in _surface_blocks(scene, low, voxel_m)]
+    part_at = _parts(scene, _BLOCK_CELLS * voxel_m)
+    pieces = [
+        _mesh_block(part_at(low + voxel_m * first), low, first, voxel_m)
+        for first in _surface_blocks(scene, low, voxel_m)
+    ]
     vertices, faces = _joined([piece for piece in pieces if piece is not None])
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(digits_vertex=int(np.ceil(-np.log10(_WELD * voxel_m))))
@@ -44,6 +52,19 @@ def reference_mesh(scene: Scene, voxel_m: float = 0.01) -> trimesh.Trimesh:
     on_surface = _in_chunks(lambda points: _onto_surface(scene, points, bound), mesh.vertices)
     color = display(_in_chunks(lambda points: radiance(scene, points), on_surface))
     return trimesh.Trimesh(on_surface, mesh.faces, vertex_colors=color, process=False)
+
+
+def _parts(scene: Scene, block_m: float) -> Callable[[Float64[np.ndarray, "3"]], Scene]:
+    """The scene around a block of that side that begins at a point: the whole of a small one."""
+
+    @cache
+    def part(column: tuple[int, int]) -> Scene:
+        low = _PART_M * np.array(column, np.float64)
+        return nearby(scene, low, low + _PART_M + block_m)
+
+    if not is_large(scene):
+        return lambda _: scene
+    return lambda begin: part((int(begin[0] // _PART_M), int(begin[2] // _PART_M)))
 
 
 def _surface_blocks(scene: Scene, low: Float64[np.ndarray, "3"], voxel_m: float) -> Int[np.ndarray, "B 3"]:

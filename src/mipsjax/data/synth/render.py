@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt8
 
 from mipsjax.core.camera import Intrinsics
+from mipsjax.data.synth.cull import in_view
 from mipsjax.data.synth.scene import Components, Scene, Shapes, Surface, components, local, turned
 from mipsjax.data.synth.texture import albedo
 
@@ -67,7 +68,10 @@ def render(scene: Scene, intrinsics: Intrinsics, T_world_cam: Float64[np.ndarray
     """
     fx, fy, cx, cy, width, height = intrinsics
     pinhole = jnp.array([fx, fy, cx, cy], jnp.float32)
-    views = [_view(scene, jnp.asarray(pose, jnp.float32), pinhole, height, width) for pose in T_world_cam]
+    views = [
+        _view(in_view(scene, intrinsics, pose), jnp.asarray(pose, jnp.float32), pinhole, height, width)
+        for pose in T_world_cam
+    ]
     light = np.mean([np.asarray(color) for color, _ in views], axis=0)
     return Image(display(light), np.asarray(views[len(views) // 2][1]))
 
