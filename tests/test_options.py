@@ -79,7 +79,10 @@ def test_contradictions_are_found() -> None:
         ({"map": 3}, "map is a section of options, got 3"),
         ({"field": {"hidden": 64}}, "field.hidden must be a list, got 64"),
         ({"field": {"classification": 1}}, "field.classification must be true or false, got 1"),
-        ({"field": {"encoding": "hush"}}, "field.encoding must be one of frequency, hash, joint, both, got 'hush'"),
+        (
+            {"field": {"encoding": "hush"}},
+            "field.encoding must be one of frequency, hash, joint, both, got 'hush'",
+        ),
         ({"mesh": {"voxel": "big"}}, "mesh.voxel must be a number, got 'big'"),
     ],
 )

@@ -122,9 +122,9 @@ class MapConfig:
     """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
     pose_learning_rate: float = 5e-4
     """Of the twist of each frame, metres and radians."""
-    pose_rate_slow: float = 0.1
-    """Share of that rate where the camera has hardly moved: Adam's first steps are as long as its rate however
-    small the gradient, and would shake poses that are known to a millimetre. 1 is the paper."""
+    pose_rate_slow: float = 0.0
+    """Share of that rate where the camera has hardly moved, and after the last frame: Adam's steps are as long as
+    its rate however small the gradient, and would shake poses that are known to a millimetre. 1 is the paper."""
     width_px: int = 160
     """Images are decimated to about this width for mapping; it bounds the memory of a keyframe."""
 
@@ -200,6 +200,17 @@ class RefineConfig:
     """Points are weighted by their uncertainty, with `lm`; the paper does so in RO only."""
     entropy_floor: float = 0.3
     """Nats; bounds that weight of a certain point."""
+    views: int = 3
+    """Keyframes near the last pose to whose depth images a frame is aligned as well, with `lm`; 0 is none, as in
+    the paper. They hold a new view before the networks have learned it."""
+    view_weight: float = 0.3
+    """Of a point in each of these, relative to a certain one in the map."""
+    view_robust: float = 0.01
+    """Metres, scale of their Cauchy weight."""
+    view_translation: float = 0.5
+    """Metres from the last pose within which such keyframes lie."""
+    view_rotation: float = 0.5
+    """Radians, the same."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +350,7 @@ PAPER = Config(
     ),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
-        go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False),
+        go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
     ),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, margin=0.0),

@@ -9,6 +9,7 @@ from __future__ import annotations
 from time import perf_counter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +17,7 @@ from mipsjax.bundle import CHOOSE, INIT, TRACK, adjust, make_keyframe, random_ke
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.policy import Decision, FrameStats, Status, decide, widening
 from mipsjax.state import (
@@ -81,9 +83,26 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
         random_key(cfg, TRACK, len(state.records)),
         state.camera,
         cfg,
+        _views(state, cfg),
     )
     T, info = jax.device_get((T, info))
     return rigid(T), info
+
+
+def _views(state: SlamState, cfg: Config) -> Views:
+    """Keyframes near the last pose, spread evenly from the oldest, which has drifted least, to the newest."""
+    last, go = last_pose(state), cfg.track.go
+    near = [
+        keyframe
+        for keyframe in state.keyframes
+        if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
+    ] or [state.keyframes[-1]]
+    chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
+    height, width = near[0].depth.shape
+    return Views(
+        jnp.asarray(np.array([k.depth for k in chosen], np.float32).reshape(-1, height, width)),
+        jnp.asarray(np.array([k.T_sub_cam for k in chosen], np.float32).reshape(-1, 4, 4)),
+    )
 
 
 def _learn(

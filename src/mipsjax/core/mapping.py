@@ -19,6 +19,9 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
+from mipsjax.core.views import planes_at
+
+STEEPEST = 0.25  # least |n . ray|: normals at grazing angles are too uncertain for more
 
 
 class Submap(NamedTuple):
@@ -215,27 +218,17 @@ def draw_pixels(
         *grid_shape(cfg.map.pixels, height, width), jax.random.uniform(key, (2,)), height, width
     )
     ray = rays(v, u, camera)
-    slope = surface_slope(depth, v, u, ray, camera) if cfg.sample.perpendicular else jnp.ones(u.shape)
+    slope = surface_slope(depth, v, u, camera) if cfg.sample.perpendicular else jnp.ones(u.shape)
     return Pixels(ray, depth[v, u], slope, color[v, u].astype(jnp.float32) / 255)
 
 
-def surface_slope(depth, v, u, ray, camera, step: int = 2) -> Float[Array, " P"]:
-    """|n . ray| of the surface at each pixel, from central differences of the depth image."""
-    height, width = depth.shape
-
-    def point(dv, du):
-        vv, uu = jnp.clip(v + dv, 0, height - 1), jnp.clip(u + du, 0, width - 1)
-        d = depth[vv, uu]
-        return rays(vv, uu, camera) * d[:, None], d
-
-    (right, d_r), (left, d_l) = point(0, step), point(0, -step)
-    (down, d_d), (up, d_u) = point(step, 0), point(-step, 0)
-    normal = jnp.cross(right - left, down - up)
-    length = jnp.linalg.norm(normal, axis=-1)
-    slope = jnp.abs(jnp.sum(normal * ray, -1)) / jnp.maximum(length, 1e-12)
-    here = depth[v, u]
-    smooth = jnp.stack([jnp.abs(d - here) < 0.05 * here for d in (d_r, d_l, d_d, d_u)]).all(0)
-    return jnp.where(smooth & (length > 1e-9), jnp.clip(slope, 0.25, 1.0), 1.0)
+def surface_slope(
+    depth: Float[Array, "H W"], v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
+) -> Float[Array, " P"]:
+    """|n . ray| of the surface at each pixel; 1 where the depth image has no normal."""
+    planes = planes_at(depth, v, u, camera)
+    slope = jnp.abs(jnp.sum(planes.normal * rays(v, u, camera), -1))
+    return jnp.where(planes.smooth, jnp.clip(slope, STEEPEST, 1.0), 1.0)
 
 
 def _finite(tree) -> Bool[Array, ""]:

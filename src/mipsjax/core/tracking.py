@@ -19,10 +19,12 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, particles, sampling
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, transform
+from mipsjax.core.views import Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
+VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
 PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
@@ -83,45 +85,87 @@ def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: n
     return Fit(jnp.sqrt(cost), known)
 
 
+class System(NamedTuple):
+    """Cost, and the normal equations of one second-order step."""
+
+    cost: Float[Array, ""]
+    hessian: Float[Array, "6 6"]
+    slope: Float[Array, "6"]
+
+
 def levenberg_marquardt(
-    field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, steps: int, cfg: Config
+    field: nf.Field,
+    T: Float[Array, "4 4"],
+    points: Points,
+    part: nf.Part,
+    steps: int,
+    cfg: Config,
+    views: Views | None = None,
+    view_camera: Intrinsics | None = None,
 ) -> Float[Array, "4 4"]:
     """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
 
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
-    the map is never an improvement.
+    the map is never an improvement. Depth images of keyframes are a second term where `views` are given.
     """
-    scale = cfg.track.go.robust
+    go, scale = cfg.track.go, cfg.track.go.robust
+
+    def jacobian(T, gradient):
+        gradient = gradient @ T[:3, :3]
+        return jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
 
     def distance(p_sub):
         prediction = nf.tsdf(field, p_sub, cfg.field, part)
         return prediction.psi, prediction.entropy
 
-    def system(T):
+    def from_map(T):
         psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
-        gradient = pull(jnp.ones_like(psi))[0] @ T[:3, :3]
-        jacobian = jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
+        rows = jacobian(T, pull(jnp.ones_like(psi))[0])
         weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
-        if cfg.track.go.uncertainty:
-            weight *= losses.certainty(entropy, cfg.track.go.entropy_floor)
-        weighted = jacobian.T * weight[None]
-        return jnp.sum(robust_cost(psi, scale) * points.mask), weighted @ jacobian, weighted @ psi
+        if go.uncertainty:
+            weight *= losses.certainty(entropy, go.entropy_floor)
+        return _system(psi, rows, weight, robust_cost(psi, scale) * points.mask)
+
+    def from_view(T, errors):
+        rows, narrow = jacobian(T, errors.normal), go.view_robust
+        weight = go.view_weight * points.mask * errors.mask / (1 + (errors.distance / narrow) ** 2)
+        # A point that falls on nothing costs as much as one that is as far off as is allowed
+        off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
+        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * points.mask)
+
+    def system(T):
+        total = from_map(T)
+        if views is None or view_camera is None:
+            return total
+        errors = plane_errors(views, transform(T, points.p_cam), view_camera, VIEW_REACH)
+        each = jax.vmap(from_view, (None, 0))(T, errors)
+        return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, each)
 
     def step(carry, _):
         here, damping = carry
-        T, (cost, hessian, slope) = here
-        damped = hessian + damping * jnp.diag(jnp.diag(hessian)) + PRIOR * jnp.eye(6)
-        twist = -jnp.linalg.solve(damped, slope)
+        T, now = here
+        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + PRIOR * jnp.eye(6)
+        twist = -jnp.linalg.solve(damped, now.slope)
         T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
         there = T_new, system(T_new)
-        better = there[1][0] < cost
+        better = there[1].cost < now.cost
         here = jax.tree.map(partial(jnp.where, better), there, here)
         return (here, damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)), None
 
     start = ((T, system(T)), jnp.float32(DAMPING))
     ((T, _), _), _ = jax.lax.scan(step, start, None, length=steps)
     return T
+
+
+def _system(
+    residual: Float[Array, " P"],
+    jacobian: Float[Array, "P 6"],
+    weight: Float[Array, " P"],
+    cost: Float[Array, " P"],
+) -> System:
+    weighted = jacobian.T * weight[None]
+    return System(jnp.sum(cost), weighted @ jacobian, weighted @ residual)
 
 
 def adam(
@@ -174,8 +218,12 @@ def track(
     key: PRNGKeyArray,
     camera: Intrinsics,
     cfg: Config,
+    views: Views | None = None,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
+
+    `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
+    field also align the frame to.
 
     With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best
     candidate, and RO then GO follow where that did not converge; the better end is kept. `widening` is a factor
@@ -188,6 +236,7 @@ def track(
     search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
     start = candidates[jnp.argmin(search_cost)]
     before = measure_fit(field, start, points, "whole", cfg)
+    view_camera = None if views is None else camera.decimated(round(camera.width / views.depth.shape[2]))
 
     def refined(T):
         if go.method == "adam":
@@ -195,7 +244,7 @@ def track(
         elif go.method == "lm":
             if cfg.field.encoding == "both":
                 T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg)
-            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg)
+            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg, views, view_camera)
         return T, measure_fit(field, T, points, "whole", cfg)
 
     def searched(T):

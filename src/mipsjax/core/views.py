@@ -1,0 +1,89 @@
+"""Points against depth images of keyframes: the map as it was measured, for what the networks do not know yet."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mipsjax.core.camera import Intrinsics, project, rays
+
+STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
+JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
+BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
+
+
+class Views(NamedTuple):
+    """K posed depth images of one size; K may be 0."""
+
+    depth: Float[Array, "K h w"]
+    """Metres, 0 for no measurement."""
+    T_sub_cam: Float[Array, "K 4 4"]
+
+
+class Planes(NamedTuple):
+    """The surface at P pixels of a depth image, camera frame."""
+
+    point: Float[Array, "P 3"]
+    """Metres."""
+    normal: Float[Array, "P 3"]
+    """Unit vectors towards the camera."""
+    smooth: Bool[Array, " P"]
+    """The four neighbours are on the same surface; elsewhere the normal means nothing."""
+    flat: Bool[Array, " P"]
+    """And it is a plane around the pixel."""
+
+
+class PlaneErrors(NamedTuple):
+    """P points against K views."""
+
+    distance: Float[Array, "K P"]
+    """Signed distance to the plane seen at the pixel where the point falls, metres; 0 where masked."""
+    normal: Float[Array, "K P 3"]
+    """Submap frame."""
+    mask: Bool[Array, "K P"]
+
+
+def plane_errors(views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, reach: float) -> PlaneErrors:
+    """Projective point-to-plane distances (Blais and Levine 1995). `camera` is that of the views.
+
+    Masked where the point is out of view, the image has no plane there, or the two are `reach` metres apart.
+    """
+
+    def one(depth, T_sub_cam):
+        R = T_sub_cam[:3, :3]
+        p_cam = (p_sub - T_sub_cam[None, :3, 3]) @ R
+        u, v = jnp.round(project(p_cam, camera)).T
+        height, width = depth.shape
+        seen = (p_cam[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        v, u = jnp.clip(v, 0, height - 1).astype(jnp.int32), jnp.clip(u, 0, width - 1).astype(jnp.int32)
+        planes = planes_at(depth, v, u, camera)
+        distance = jnp.sum((p_cam - planes.point) * planes.normal, -1)
+        mask = seen & planes.flat & (jnp.abs(distance) < reach)
+        return PlaneErrors(jnp.where(mask, distance, 0.0), planes.normal @ R.T, mask)
+
+    return jax.vmap(one)(views.depth, views.T_sub_cam)
+
+
+def planes_at(
+    depth: Float[Array, "h w"], v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
+) -> Planes:
+    """Points and normals at some pixels, from central differences of the depth image."""
+    height, width = depth.shape
+
+    def point(dv, du):
+        vv, uu = jnp.clip(v + dv, 0, height - 1), jnp.clip(u + du, 0, width - 1)
+        return rays(vv, uu, camera) * depth[vv, uu][:, None]
+
+    here = point(0, 0)
+    right, left, down, up = point(0, STEP), point(0, -STEP), point(STEP, 0), point(-STEP, 0)
+    normal = jnp.cross(down - up, right - left)
+    squared = jnp.sum(normal**2, -1)
+    exists = squared > 1e-18
+    normal = normal * jax.lax.rsqrt(jnp.where(exists, squared, 1.0))[:, None]
+    jumps = [jnp.abs(p[:, 2] - here[:, 2]) < JUMP * here[:, 2] for p in (right, left, down, up)]
+    smooth = jnp.stack(jumps).all(0) & exists
+    off = [jnp.abs(jnp.sum(((a + b) / 2 - here) * normal, -1)) for a, b in ((right, left), (down, up))]
+    return Planes(here, normal, smooth, smooth & (jnp.maximum(*off) < BEND))

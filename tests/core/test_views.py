@@ -1,0 +1,93 @@
+"""Depth images of keyframes as a map: distances against the exact planes, and the pose they hold alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see
+
+from mipsjax.core import field as nf
+from mipsjax.core import tracking
+from mipsjax.core.views import Views, plane_errors, planes_at
+
+KEY = jax.random.key(11)
+REACH = 0.1
+INWARD = np.diag([1.0, -1.0, -1.0])  # of the walls x, y, z: x rises, y and z fall into the room
+TRUTH = HOME @ pose((2.0, 1.0, -1.0), (0.03, 0.02, -0.02))
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return Views(np.stack([see(T)[0] for T in VIEWS[:3]]), VIEWS[:3].astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def on_walls() -> np.ndarray:
+    """Points of the three walls that the first view sees, away from the edges between them."""
+    depth = see(HOME)[0]
+    v, u = (x.ravel() for x in np.mgrid[8 : CAMERA.height - 8 : 7, 8 : CAMERA.width - 8 : 7])
+    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], 1)
+    points = (ray * depth[v, u, None]) @ HOME[:3, :3].T + HOME[:3, 3]
+    clear = np.sort(np.abs(points - WALLS), axis=1)[:, 1] > 0.25
+    return points[clear].astype(np.float32)
+
+
+def test_normals_are_those_of_the_walls(views):
+    v, u = (x.ravel() for x in np.mgrid[4 : CAMERA.height - 4 : 5, 4 : CAMERA.width - 4 : 5])
+    planes = planes_at(jnp.asarray(views.depth[0]), v, u, CAMERA)
+    inward = np.asarray(planes.normal) @ HOME[:3, :3].T
+    wall = np.abs(np.asarray(planes.point) @ HOME[:3, :3].T + HOME[:3, 3] - WALLS).argmin(1)
+    expected = INWARD[wall]
+    flat = np.asarray(planes.flat)
+    assert flat.mean() > 0.8
+    off = np.abs(inward[flat] - expected[flat]).max(1)
+    # Differences of a float32 depth; next to an edge a neighbour may be on the other wall, nearly in the plane
+    assert np.mean(off < 2e-3) > 0.98 and off.max() < 0.15
+
+
+def test_distances_to_the_walls_are_exact(views, on_walls):
+    """Points moved off the walls by a known length, towards the room or into the wall."""
+    for offset in (0.0, 0.02, -0.03):
+        wall = np.abs(on_walls - WALLS).argmin(1)
+        inward = INWARD[wall]
+        errors = plane_errors(views, jnp.asarray(on_walls + offset * inward, jnp.float32), CAMERA, REACH)
+        assert errors.mask[0].mean() > 0.8 and errors.mask.shape == (3, len(on_walls))
+        found = np.asarray(errors.distance)[np.asarray(errors.mask)]
+        np.testing.assert_allclose(np.median(found), offset, atol=1e-4)
+        # A point may fall on the next wall near an edge
+        assert np.mean(np.abs(found - offset) < 1e-3) > 0.95
+
+
+def test_what_is_not_seen_is_masked(views, on_walls):
+    behind = jnp.asarray(on_walls - 20 * HOME[:3, 2], jnp.float32)
+    assert not plane_errors(views, behind, CAMERA, REACH).mask.any()
+    wall = np.abs(on_walls - WALLS).argmin(1)
+    off = jnp.asarray(on_walls + 0.15 * INWARD[wall], jnp.float32)  # the other walls are 25 cm away
+    assert not plane_errors(views, off, CAMERA, REACH).mask.any()
+    empty = views._replace(depth=np.zeros_like(views.depth))
+    errors = plane_errors(empty, jnp.asarray(on_walls), CAMERA, REACH)
+    assert not errors.mask.any() and jnp.all(jnp.isfinite(errors.normal))
+
+
+def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
+    """In a map that has learned nothing psi is about 0 everywhere and certain of nothing."""
+    cfg = replace(CFG, track=replace(CFG.track, go=replace(CFG.track.go, view_weight=1.0)))
+    field = nf.init(KEY, cfg.field)
+    depth, color = see(TRUTH)
+    points = tracking.draw_points(KEY, depth, color, cfg.track.go.pixels, CAMERA)
+    start = (TRUTH @ pose((1.2, -1.2, 1.0), (0.012, -0.012, 0.01))).astype(np.float32)
+
+    @jax.jit
+    def end(given):
+        return tracking.levenberg_marquardt(
+            field, jnp.asarray(start), points, "whole", cfg.track.go.steps, cfg, given, CAMERA
+        )
+
+    metres, degrees = apart(np.asarray(end(views)), TRUTH)
+    assert metres < 0.002 and degrees < 0.1  # the fresh networks pull a little at random
+    none = Views(np.zeros((0, *depth.shape), np.float32), np.zeros((0, 4, 4), np.float32))
+    assert apart(np.asarray(end(none)), TRUTH)[0] > 0.005, "without views nothing holds it"
