@@ -43,7 +43,7 @@ def small(cfg: Config) -> Intrinsics:
     return CAMERA.decimated(max(1, round(CAMERA.width / cfg.map.width_px)))
 
 
-def fitted(cfg: Config) -> mapping.Submap:
+def fitted(cfg: Config) -> mapping.Learned:
     """A submap that knows the wall, so that tracking takes its ordinary way."""
     camera = small(cfg)
     submap = mapping.create(KEY, cfg)

@@ -29,7 +29,7 @@ KEYFRAMES, STEPS = 24, 1500
 WIDENING = 2.0  # of the first swarm, so that it reaches the farthest start
 
 
-def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Submap, list[np.ndarray]]:
+def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Learned, list[np.ndarray]]:
     """A submap fitted to evenly spaced frames, and the true pose of each frame in it."""
     truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
     picked = np.linspace(0, len(sequence) - 1, KEYFRAMES).astype(int)
@@ -57,7 +57,7 @@ def starts(count: int, frames: int, seed: int) -> list[tuple[int, np.ndarray]]:
 
 
 def share(
-    submap: mapping.Submap, truth: list[np.ndarray], sequence: Sequence, cfg: Config, count: int
+    submap: mapping.Learned, truth: list[np.ndarray], sequence: Sequence, cfg: Config, count: int
 ) -> float:
     done = 0
     for number, (frame, twist) in enumerate(starts(count, len(sequence), cfg.seed)):

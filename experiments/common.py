@@ -20,7 +20,7 @@ from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
 from mipsjax.final import finish
 from mipsjax.host.metrics import absolute_error, relative_error
-from mipsjax.state import SlamState, trajectory
+from mipsjax.state import SlamState, keyframes, map_bytes, trajectory
 
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"
@@ -79,7 +79,9 @@ def figures(state: SlamState, sequence: Sequence) -> dict[str, Any]:
         "ok": statuses["ok"],
         "weak": statuses["weak"],
         "lost": statuses["lost"] + statuses["skipped"],
-        "keyframes": len(state.keyframes),
+        "keyframes": keyframes(state),
+        "submaps": len(state.submaps),
+        "loops": sum(loop.weight > 0 for loop in state.loops),
         "ro_frames": sum(info.searched for info in timed),
         "track_ms": float(np.mean([info.track_ms for info in timed])),
         "map_ms": float(np.mean([info.map_ms for info in timed])),
@@ -91,11 +93,6 @@ def figures(state: SlamState, sequence: Sequence) -> dict[str, Any]:
 def peak_mb() -> float:
     """Largest resident memory of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def map_bytes(state: SlamState) -> int:
-    """Size of the networks of the submap."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(state.submap.field))
 
 
 def changed(cfg: Config, section: str, **fields: Any) -> Config:

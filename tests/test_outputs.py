@@ -18,13 +18,14 @@ from mipsjax import outputs
 from mipsjax.bundle import make_keyframe
 from mipsjax.config import Config, preset
 from mipsjax.core import mapping
+from mipsjax.core.volume import Box
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import OutputError
 from mipsjax.files import write_atomically
 from mipsjax.policy import Status
 from mipsjax.reconstruct import observed_points, reconstruct
-from mipsjax.state import FrameInfo, Record, SlamState
+from mipsjax.state import FrameInfo, Record, SlamState, Submap
 from mipsjax.summary import FrameRow, Run, metrics_content, verdict
 
 CFG = preset("tiny")
@@ -43,11 +44,13 @@ def run() -> Run:
         FrameInfo(),
     ]
     records = tuple(
-        Record(frame.number, frame.timestamp, 0, np.eye(4), status, info)
+        Record(frame.number, frame.timestamp, 0, 0, np.eye(4), status, info)
         for frame, info, status in zip(frames[1:], infos, (Status.OK, Status.SKIPPED, Status.OK), strict=True)
     )
-    submap = mapping.create(jax.random.key(0), CFG)
-    state = SlamState(submap, (keyframe,), records, sequence.T_world_cam[1], sequence.intrinsics, 0)
+    box = Box(np.full(3, -4.0), np.full(3, 4.0))
+    learned = mapping.create(jax.random.key(0), CFG)
+    submap = Submap(learned, box, (keyframe,), sequence.T_world_cam[1])
+    state = SlamState((submap,), 0, records, sequence.intrinsics, 0)
     waited = (FrameRow(0, 0.0, Status.SKIPPED, FrameInfo(note="no depth")),)
     return Run(sequence, state, waited, (0.1,) * 4, (0.2,) * 4, "done")
 
@@ -172,11 +175,11 @@ def test_53_a_field_that_is_not_finite_gives_an_empty_mesh(
     run: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert run.state is not None
-    submap = jax.tree.map(
-        lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, run.state.submap
+    learned = jax.tree.map(
+        lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, run.state.submap.learned
     )
     with jax.numpy_rank_promotion("allow"):
-        mesh = reconstruct(run.state._replace(submap=submap), CFG)
+        mesh = reconstruct(run.state.with_submap(0, learned=learned), CFG)
     assert len(mesh.faces) == 0 and "mesh is empty" in caplog.text
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mipsjax.config import Config as Config
     from mipsjax.config import preset as preset
     from mipsjax.core.camera import Intrinsics as Intrinsics
-    from mipsjax.core.mapping import Submap as Submap
+    from mipsjax.core.mapping import Learned as Learned
     from mipsjax.core.mapping import refine as refine
     from mipsjax.core.particles import fitness as fitness
     from mipsjax.core.tracking import track as track
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from mipsjax.slam import start as start
     from mipsjax.slam import step as step
     from mipsjax.state import SlamState as SlamState
+    from mipsjax.state import Submap as Submap
     from mipsjax.state import trajectory as trajectory
 
     __version__: str
@@ -55,13 +56,14 @@ _PLACES = {
     "ConfigError": "errors:ConfigError",
     "Frame": "data.sequence:Frame",
     "InputError": "errors:InputError",
+    "Learned": "core.mapping:Learned",
     "Intrinsics": "core.camera:Intrinsics",
     "MipsjaxError": "errors:MipsjaxError",
     "OutputError": "errors:OutputError",
     "Sequence": "data.sequence:Sequence",
     "SlamState": "state:SlamState",
     "Status": "policy:Status",
-    "Submap": "core.mapping:Submap",
+    "Submap": "state:Submap",
     "TrackingLostError": "errors:TrackingLostError",
     "fitness": "core.particles:fitness",
     "open_sequence": "data.open:open_sequence",

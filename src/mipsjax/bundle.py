@@ -1,4 +1,4 @@
-"""Local bundle adjustment on the host: keyframes in, the submap and their poses after it out."""
+"""Local bundle adjustment on the host: keyframes in, the networks and their poses after it out."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from mipsjax.config import Config
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
-from mipsjax.state import Keyframe, Pose, rigid
+from mipsjax.state import Keyframe, Pose, Submap, rigid
 
 # Purposes of random draws: a draw added in one place moves no other.
-INIT, TRACK, MAP, CHOOSE, FINISH = range(5)
+INIT, TRACK, MAP, CHOOSE, FINISH, BACKGROUND, MATCH = range(7)
 
 
 def random_key(cfg: Config, purpose: int, number: int) -> jax.Array:
@@ -35,8 +35,35 @@ def make_keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camer
     )
 
 
+def mapping_camera(camera: Intrinsics, cfg: Config) -> Intrinsics:
+    """Of the images of a keyframe."""
+    return camera.decimated(mapping_stride(camera, cfg))
+
+
+def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
+    """Places of the anchor and of `others` random keyframes of a submap; the anchor again where there are too few."""
+    count = len(submap.keyframes)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(np.arange(1, count), min(others, count - 1), replace=False) if count > 1 else []
+    picked = [0, *(int(i) for i in chosen)]
+    return picked + [0] * (1 + others - len(picked))
+
+
+def refine(
+    submap: Submap, chosen: list[int], share: float, steps: int, number: int, camera: Intrinsics, cfg: Config
+) -> tuple[Submap, bool]:
+    """`adjust` on some keyframes of a submap itself, all but the anchor at a share of the pose rate."""
+    batch = [submap.keyframes[i] for i in chosen]
+    rates = [share if i != 0 else 0.0 for i in chosen]
+    learned, poses, ok = adjust(submap.learned, batch, rates, steps, number, camera, cfg)
+    keyframes = list(submap.keyframes)
+    for i, pose in zip(chosen, poses, strict=True):
+        keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
+    return submap._replace(learned=learned, keyframes=tuple(keyframes)), ok
+
+
 def adjust(
-    submap: mapping.Submap,
+    learned: mapping.Learned,
     batch: list[Keyframe],
     rates: list[float],
     steps: int,
@@ -44,10 +71,10 @@ def adjust(
     camera: Intrinsics,
     cfg: Config,
     rate: float = 1.0,
-) -> tuple[mapping.Submap, list[Pose], bool]:
+) -> tuple[mapping.Learned, list[Pose], bool]:
     """`mapping.refine` on a batch: shares of the pose rate for each keyframe (0: fixed), of the networks' rate.
 
-    Returns the submap, the poses and whether all stayed finite; if not, nothing has changed.
+    Returns what was learned, the poses and whether all stayed finite; if not, nothing has changed.
     """
     frames = mapping.Frames(
         depth=jnp.asarray(np.stack([k.depth for k in batch])),
@@ -55,12 +82,12 @@ def adjust(
         T_sub_cam=jnp.asarray(np.stack([k.T_sub_cam for k in batch]), jnp.float32),
         movable=jnp.asarray(np.array(rates, np.float32)),
     )
-    small = camera.decimated(mapping_stride(camera, cfg))
-    submap, poses, info = mapping.refine(
-        submap, frames, jnp.int32(steps), random_key(cfg, MAP, number), small, cfg, np.float32(rate)
+    small = mapping_camera(camera, cfg)
+    learned, poses, info = mapping.refine(
+        learned, frames, jnp.int32(steps), random_key(cfg, MAP, number), small, cfg, np.float32(rate)
     )
     moved = [
         rigid(pose) if rate else k.T_sub_cam
         for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)
     ]
-    return submap, moved, bool(info.ok)
+    return learned, moved, bool(info.ok)

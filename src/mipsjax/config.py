@@ -110,9 +110,14 @@ class MapConfig:
     """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""
     first_steps: int = 200
     """On the anchor of a new submap (paper: 500)."""
+    submap_steps: int = 200
+    """The same for later submaps, on the anchor and the keyframes before it; 0 is the paper's ablation "No SI"."""
+    revisit_steps: int = 10
+    """Of an inactive submap on the frame with which it becomes active again, together with keyframes of its own; 0
+    is the paper's ablation "No SR"."""
     final_steps: int = 600
-    """After the last frame, over all keyframes, with a falling learning rate; 0 is none, as in the paper, whose
-    background thread has refined each submap many times over by then."""
+    """After the last frame, over all keyframes of each submap, with a falling learning rate; 0 is none, as in the
+    paper, whose background thread has refined each submap many times over by then."""
     frames: int = 5
     """The current frame, the anchor, and randomly chosen keyframes."""
     pixels: int = 256
@@ -248,9 +253,61 @@ class VolumeConfig:
     hysteresis: float = 0.1
     """Another submap takes over where it holds this much more of the view than the active one (paper: none given).
     Without it two submaps of about the same overlap take turns."""
+    support: int = 4
+    """Keyframes of the last submap with which a new one is begun, beside its anchor; the paper has the anchor alone."""
     margin: float = 0.1
     """Metres added to the box beyond what a keyframe sees; not in the paper. As the truncation, so that the region
     behind a wall in which its distance is learned belongs to the box."""
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """Refinement of inactive submaps, one after the other."""
+
+    every_frames: int = 4
+    """Frames between two refinements; 0 is none. The paper's second process refines all the time."""
+    steps: int = 10
+    """Of local bundle adjustment on the anchor and random keyframes of the submap."""
+    pose_rate: float = 0.0
+    """Share of the pose learning rate (see `map.pose_rate_slow`); 1 is the paper."""
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Loops between submaps, and finding a lost camera again."""
+
+    enabled: bool = True
+    """Off: submaps stay where they were begun (the paper's ablation "No LC")."""
+    relocalise: bool = True
+    """A lost camera is looked for in all submaps; not in the paper."""
+    patience: int = 60
+    """Lost frames in a row after which a new submap is begun, that hangs on nothing until a loop joins it."""
+    apart: int = 4
+    """Links between two submaps, along the chain, from which meeting again counts as a loop."""
+    features: bool = True
+    """Loops are also looked for by image features, not only in the box of a submap."""
+    candidates: int = 3
+    """Keyframes that look most like a frame and are tried."""
+    overlap: float = 0.4
+    """Least share of a frame's pixels that the other submap must know for a link to it."""
+    inliers: float = 0.8
+    """Least share of these that must be within `keyframe.error` of its surface."""
+    drift: float = 0.01
+    """Metres of drift for each metre from the anchor: what a linked pose is worth in the pose graph."""
+    drift_rotation: float = 0.003
+    """Radians of drift for each metre from the anchor."""
+    sigma: float = 0.005
+    """Metres, the same at the anchor."""
+    sigma_rotation: float = 0.002
+    """Radians, the same at the anchor."""
+    fewest_points: int = 200
+    """Matched surface points from which a pair of submaps is also held by them; below, by linked poses alone."""
+    points_sigma: float = 0.01
+    """Metres, of a matched point across the surface."""
+    effective_points: float = 20.0
+    """Matched points that count as independent: neighbours share their error."""
+    tolerance: float = 0.01
+    """Metres (or as many times 1 rad) by which a frame's poses in two submaps may differ before the graph is solved."""
 
 
 @dataclass(frozen=True)
@@ -321,6 +378,8 @@ class Config:
     keyframe: KeyframeConfig = KeyframeConfig()
     guard: GuardConfig = GuardConfig()
     volume: VolumeConfig = VolumeConfig()
+    background: BackgroundConfig = BackgroundConfig()
+    loop: LoopConfig = LoopConfig()
     correspond: CorrespondConfig = CorrespondConfig()
     blend: BlendConfig = BlendConfig()
     mesh: MeshConfig = MeshConfig()
@@ -343,6 +402,7 @@ PAPER = Config(
         steps_slow=15,
         pose_rate_slow=1.0,
         first_steps=500,
+        submap_steps=500,
         final_steps=0,
         pixels=384,
         momentum=0.9,
@@ -353,7 +413,9 @@ PAPER = Config(
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
     ),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
-    volume=VolumeConfig(governs="frustum", hysteresis=0.0, margin=0.0),
+    volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
+    background=BackgroundConfig(every_frames=1, pose_rate=1.0),
+    loop=LoopConfig(relocalise=False),
     blend=BlendConfig(fade=0.0),
 )
 TINY = Config(
@@ -362,7 +424,15 @@ TINY = Config(
     ),
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
     loss=LossConfig(cross_entropy_free=3.0),
-    map=MapConfig(pose_learning_rate=1e-3, steps=4, steps_slow=4, first_steps=60, final_steps=40, pixels=64),
+    map=MapConfig(
+        pose_learning_rate=1e-3,
+        steps=4,
+        steps_slow=4,
+        first_steps=60,
+        submap_steps=60,
+        final_steps=40,
+        pixels=64,
+    ),
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
         go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),

@@ -15,39 +15,45 @@ ALIGNED = 16  # frames in one call of `tracking.align`
 
 
 def finish(state: SlamState, cfg: Config) -> SlamState:
-    """The state after the last frame: `map.final_steps` steps of mapping, then `track.go.final_steps` of tracking."""
-    state = _adjusted(state, cfg)
-    return _aligned(state, cfg) if cfg.track.go.final_steps and cfg.track.go.method == "lm" else state
+    """The state after the last frame: `map.final_steps` steps of mapping of each submap, then `track.go.final_steps`
+    of tracking of each frame."""
+    for place in range(len(state.submaps)):
+        state = _adjusted(state, place, cfg)
+    if cfg.track.go.final_steps and cfg.track.go.method == "lm":
+        for place in range(len(state.submaps)):
+            state = _aligned(state, place, cfg)
+    return state
 
 
-def _adjusted(state: SlamState, cfg: Config) -> SlamState:
+def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
     """Bundle adjustment at rates that fall to zero; each call takes another random batch, the anchor stays."""
-    calls, keyframes, submap = -(-cfg.map.final_steps // BATCH_STEPS), list(state.keyframes), state.submap
+    submap = state.submaps[place]
+    calls, keyframes, learned = -(-cfg.map.final_steps // BATCH_STEPS), list(submap.keyframes), submap.learned
     for call in range(calls):
-        rng = np.random.default_rng((cfg.seed, FINISH, call))
+        rng = np.random.default_rng((cfg.seed, FINISH, place, call))
         fresh = len(keyframes) < cfg.map.frames
         chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
         fall = 1 - call / calls
         rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
         batch, number = [keyframes[i] for i in chosen], len(state.records) + call
-        submap, poses, _ = adjust(submap, batch, rates, BATCH_STEPS, number, state.camera, cfg, fall)
+        learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, number, state.camera, cfg, fall)
         for i, pose in zip(chosen, poses, strict=True):
             keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
-    return state._replace(submap=submap, keyframes=tuple(keyframes))
+    return state.with_submap(place, learned=learned, keyframes=tuple(keyframes))
 
 
-def _aligned(state: SlamState, cfg: Config) -> SlamState:
-    """Every trusted frame at the pose where it fits the finished map; the anchor stays."""
+def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
+    """Every trusted frame of a submap at the pose where it fits the finished map; the anchor stays."""
     small = state.camera.decimated(thumbnail_stride(state.camera))
-    records = list(state.records)
-    places = [i for i, record in enumerate(records) if record.depth is not None]
+    submap, records = state.submaps[place], list(state.records)
+    places = [i for i, r in enumerate(records) if r.submap == place and r.depth is not None]
     for group in (places[i : i + ALIGNED] for i in range(0, len(places), ALIGNED)):
         filled = [group[i % len(group)] for i in range(ALIGNED)]
         depth = np.stack([_depth(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
-        poses = np.asarray(tracking.align(state.submap.field, jnp.asarray(depth), start, small, cfg))
+        poses = np.asarray(tracking.align(submap.learned.field, jnp.asarray(depth), start, small, cfg))
         for i, pose in zip(group, poses, strict=False):
-            records[i] = _moved(records[i], rigid(pose), state.keyframes)
+            records[i] = _moved(records[i], rigid(pose), submap.keyframes)
     return state._replace(records=tuple(records))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
 from math import log
 from typing import NamedTuple
@@ -61,6 +62,24 @@ def decide(stats: FrameStats, cfg: Config) -> Decision:
         map_steps=round(_between(cfg.map.steps_slow, cfg.map.steps, share)),
         pose_rate=_between(cfg.map.pose_rate_slow, 1.0, share),
     )
+
+
+STAY, NEW = -1, -2
+
+
+def governor(active: float, others: Mapping[int, float], cfg: Config) -> int:
+    """Which submap takes over after a keyframe: STAY, NEW, or the place of an old one.
+
+    `active` is the share of what the frame sees that lies in the active submap's box, `others` the same for those
+    that the frame was found in. A submap that takes over must hold more than the active one by the hysteresis.
+    """
+    if active >= cfg.volume.overlap:
+        return STAY
+    able = {place: share for place, share in others.items() if share >= cfg.volume.overlap}
+    if not able:
+        return NEW
+    best = max(able, key=able.__getitem__)
+    return best if able[best] >= active + cfg.volume.hysteresis else STAY
 
 
 def widening(trouble: int, cfg: Config) -> float:

@@ -13,13 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mipsjax.bundle import CHOOSE, INIT, TRACK, adjust, make_keyframe, random_key
+from mipsjax.background import refine_inactive
+from mipsjax.bundle import CHOOSE, TRACK, choose, make_keyframe, random_key, refine
+from mipsjax.closure import close
 from mipsjax.config import Config
-from mipsjax.core import mapping, tracking
+from mipsjax.core import tracking
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
+from mipsjax.host.features import detect
 from mipsjax.policy import Decision, FrameStats, Status, decide, widening
+from mipsjax.recovery import find_again, start_anew
 from mipsjax.state import (
     FrameInfo,
     Keyframe,
@@ -28,37 +32,34 @@ from mipsjax.state import (
     SlamState,
     distance,
     last_pose,
-    pose_of,
     rigid,
     thumbnail,
+    world_pose,
 )
+from mipsjax.territory import begin, govern, settle
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
 
 def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | None = None) -> SlamState:
-    """A new submap from its anchor, the first frame with colour and depth.
+    """A new map from its first anchor, the first frame with colour and depth.
 
     `T_world_sub` is the pose of that frame in the world, the identity if none is given.
     """
     began = perf_counter()
-    submap = mapping.create(random_key(cfg, INIT, 0), cfg)
-    keyframe = make_keyframe(frame, 0, np.eye(4), cfg, camera)
-    submap, _, ok = adjust(
-        submap, [keyframe] * cfg.map.frames, [0.0] * cfg.map.frames, cfg.map.first_steps, 0, camera, cfg
-    )
+    anchor = _keyframe(frame, 0, np.eye(4), cfg, camera)
+    T_world_sub = np.eye(4) if T_world_sub is None else T_world_sub
+    submap, ok = begin(anchor, [], T_world_sub, cfg.map.first_steps, camera, cfg)
     info = FrameInfo(
         keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
     )
-    record = Record(frame.number, frame.timestamp, 0, np.eye(4), Status.OK, info)
-    return SlamState(
-        submap, (keyframe,), (record,), np.eye(4) if T_world_sub is None else T_world_sub, camera, 0
-    )
+    record = Record(frame.number, frame.timestamp, 0, 0, np.eye(4), Status.OK, info)
+    return SlamState((submap,), 0, (record,), camera, 0)
 
 
 def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
-    """Tracks one frame, decides what it is worth, and learns from it."""
+    """Tracks one frame, decides what it is worth, learns from it, and keeps the submaps in order."""
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
     began = perf_counter()
@@ -67,15 +68,49 @@ def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
     stats = _stats(state, T_sub_cam, info)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
-        return _coast(state, frame, f"known {stats.known:.2f}", Status.LOST, cfg, info, track_ms)
-    return _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
+        return _recover(state, frame, f"known {stats.known:.2f}", info, track_ms, cfg)
+    state = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
+    if state.records[-1].info.keyframe:
+        state = _order(state, cfg)
+    return refine_inactive(state, cfg)
+
+
+def _order(state: SlamState, cfg: Config) -> SlamState:
+    """After a new keyframe: the other submaps see it, loops are closed, and the right submap takes over."""
+    began, before = perf_counter(), state
+    state, sightings = settle(state, cfg)
+    if cfg.loop.enabled:
+        state = close(state, sightings, before, cfg)
+    state = govern(state, cfg)
+    last = state.records[-1]
+    info = last.info._replace(submap=state.active, order_ms=_ms(began))
+    return state._replace(records=(*state.records[:-1], last._replace(info=info)))
+
+
+def _recover(
+    state: SlamState, frame: Frame, note: str, info: tracking.TrackInfo, track_ms: float, cfg: Config
+) -> SlamState:
+    """A lost frame: looked for in the whole map, after a while the anchor of a new submap, otherwise set aside."""
+    place = None
+    if cfg.loop.relocalise and frame.color is not None:
+        keyframe = _keyframe(frame, len(state.records), np.eye(4), cfg, state.camera)
+        place = find_again(state, keyframe, cfg)
+        if place is not None:
+            note = "found again"
+        elif state.trouble >= cfg.loop.patience:
+            place, note = start_anew(state, keyframe, cfg), "a new submap, not joined yet"
+    if place is None:
+        return _coast(state, frame, note, Status.LOST, cfg, info, track_ms)
+    details = _info(info, track_ms)._replace(note=note, submap=place.state.active)
+    record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
+    return place.state._replace(records=(*state.records, record), trouble=1)
 
 
 def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.TrackInfo]:
     assert frame.depth is not None
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     T, info = tracking.track(
-        state.submap.field,
+        state.submap.learned.field,
         frame.depth,
         color,
         np.stack(_candidates(state, frame.timestamp)).astype(np.float32),
@@ -94,9 +129,9 @@ def _views(state: SlamState, cfg: Config) -> Views:
     last, go = last_pose(state), cfg.track.go
     near = [
         keyframe
-        for keyframe in state.keyframes
+        for keyframe in state.submap.keyframes
         if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
-    ] or [state.keyframes[-1]]
+    ] or [state.submap.keyframes[-1]]
     chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
     height, width = near[0].depth.shape
     return Views(
@@ -117,32 +152,39 @@ def _learn(
     """Local bundle adjustment with the frame, which becomes a keyframe where that was decided."""
     assert frame.depth is not None
     began = perf_counter()
-    number, submap, keyframes, ok = len(state.records), state.submap, list(state.keyframes), True
+    number, ok = len(state.records), True
     mapped = frame.color is not None and decision.map_steps > 0
-    if mapped:
-        current = make_keyframe(frame, number, T_sub_cam, cfg, state.camera)
-        chosen = _choose(len(keyframes), number, cfg)
-        batch = [current, *(keyframes[i] for i in chosen)]
-        rates = [decision.pose_rate if i != 0 else 0.0 for i in (-1, *chosen)]
-        submap, poses, ok = adjust(submap, batch, rates, decision.map_steps, number, state.camera, cfg)
-        T_sub_cam = poses[0]
-        for i, pose in zip(chosen, poses[1:], strict=True):
-            keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
-        if decision.keyframe:
-            keyframes.append(current._replace(T_sub_cam=T_sub_cam))
     made = mapped and decision.keyframe
+    if mapped:
+        current = (_keyframe if made else make_keyframe)(frame, number, T_sub_cam, cfg, state.camera)
+        chosen = choose(state.submap, cfg.map.frames - 2, (cfg.seed, CHOOSE, number))
+        batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
+        steps, share = decision.map_steps, decision.pose_rate
+        newest = len(batch.keyframes) - 1
+        batch, ok = refine(batch, [newest, *chosen], share, steps, number, state.camera, cfg)
+        T_sub_cam = batch.keyframes[-1].T_sub_cam
+        kept = batch if made else batch._replace(keyframes=batch.keyframes[:-1])
+        state = state.with_submap(state.active, **kept._asdict())
     details = _info(info, track_ms)._replace(
         keyframe=made,
         map_steps=decision.map_steps if mapped else 0,
         map_ms=_ms(began),
+        submap=state.active,
         note=frame.problem if ok else "map not finite",
     )
-    record = _record(frame, keyframes, T_sub_cam, decision.status, details)
+    record = _record(frame, state, T_sub_cam, decision.status, details)
     record = record._replace(depth=thumbnail(frame.depth, state.camera))
     trouble = 0 if decision.status is Status.OK else state.trouble + 1
-    return state._replace(
-        submap=submap, keyframes=tuple(keyframes), records=(*state.records, record), trouble=trouble
-    )
+    return state._replace(records=(*state.records, record), trouble=trouble)
+
+
+def _keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camera: Intrinsics) -> Keyframe:
+    """With features, if they are wanted."""
+    keyframe = make_keyframe(frame, number, T_sub_cam, cfg, camera)
+    if not ((cfg.loop.enabled and cfg.loop.features) or cfg.loop.relocalise):
+        return keyframe
+    assert frame.depth is not None and frame.color is not None
+    return keyframe._replace(features=detect(frame.color, frame.depth, camera))
 
 
 def _coast(
@@ -157,17 +199,8 @@ def _coast(
     """A frame without a trusted pose stays where the camera was seen last; nothing is learned from it."""
     T_sub_cam = last_pose(state)
     details = (FrameInfo() if info is None else _info(info, track_ms))._replace(note=note)
-    record = _record(frame, list(state.keyframes), T_sub_cam, status, details)
+    record = _record(frame, state, T_sub_cam, status, details)
     return state._replace(records=(*state.records, record), trouble=state.trouble + 1)
-
-
-def _choose(count: int, number: int, cfg: Config) -> list[int]:
-    """Keyframes that are optimised with the current frame: the anchor and random others, repeated if too few."""
-    rng = np.random.default_rng((cfg.seed, CHOOSE, number))
-    others = cfg.map.frames - 2
-    chosen = rng.choice(np.arange(1, count), min(others, count - 1), replace=False) if count > 1 else []
-    picked = [0, *(int(i) for i in chosen)]
-    return picked + [0] * (cfg.map.frames - 1 - len(picked))
 
 
 def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
@@ -178,7 +211,7 @@ def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
         return [last, last]
     older, newer = trusted
     ratio = (timestamp - newer.timestamp) / max(newer.timestamp - older.timestamp, DT_MIN)
-    motion = np.linalg.inv(pose_of(state, older)) @ pose_of(state, newer)
+    motion = np.linalg.inv(world_pose(state, older)) @ world_pose(state, newer)
     return [last @ _scaled(motion, min(max(ratio, 0.0), DT_RATIO_MAX)), last]
 
 
@@ -192,7 +225,7 @@ def _scaled(motion: Pose, ratio: float) -> Pose:
 
 
 def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:
-    keyframe, last = state.keyframes[-1], last_pose(state)
+    keyframe, last = state.submap.keyframes[-1], last_pose(state)
     translation, rotation = distance(keyframe.T_sub_cam, T_sub_cam)
     step_translation, step_rotation = distance(last, T_sub_cam)
     return FrameStats(
@@ -207,10 +240,18 @@ def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> Frame
 
 
 def _record(
-    frame: Frame, keyframes: list[Keyframe], T_sub_cam: Pose, status: Status, info: FrameInfo
+    frame: Frame,
+    state: SlamState,
+    T_sub_cam: Pose,
+    status: Status,
+    info: FrameInfo,
+    keyframe: int | None = None,
 ) -> Record:
-    relative = np.linalg.inv(keyframes[-1].T_sub_cam) @ T_sub_cam
-    return Record(frame.number, frame.timestamp, len(keyframes) - 1, relative, status, info)
+    """Hung on a keyframe of the active submap, the newest if none is given."""
+    keyframes = state.submap.keyframes
+    keyframe = len(keyframes) - 1 if keyframe is None else keyframe
+    relative = np.linalg.inv(keyframes[keyframe].T_sub_cam) @ T_sub_cam
+    return Record(frame.number, frame.timestamp, state.active, keyframe, relative, status, info)
 
 
 def _info(info: tracking.TrackInfo, track_ms: float) -> FrameInfo:

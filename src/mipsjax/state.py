@@ -1,40 +1,66 @@
-"""What is known after a frame, as values: keyframes, records of all frames, the submap."""
+"""What is known after a frame, as values: submaps with their keyframes, and records of all frames."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8, UInt16
 
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.volume import Box
+from mipsjax.host.features import Features
 from mipsjax.policy import Status
 
 Pose = Float64[np.ndarray, "4 4"]
+How = Literal["box", "features"]
 
 THUMBNAIL_WIDTH = 48  # pixels, about; 4 kB a frame
 THUMBNAIL_UNIT = 2e-4  # metres; 16 bits then reach 13 m
 
 
 class Keyframe(NamedTuple):
-    """A frame the map is learned from, at mapping size."""
+    """A frame the map is learned from, at mapping size.
+
+    A frame that several submaps see is a keyframe in each, with the same `number` and images and a pose of its own:
+    these linked records are the measurements between submaps.
+    """
 
     number: int
     """Its place in `SlamState.records`."""
     depth: Float32[np.ndarray, "h w"]
     color: UInt8[np.ndarray, "h w 3"]
     T_sub_cam: Pose
+    features: Features | None = None
+    """For loops and relocalisation; None where neither is wanted."""
+
+
+class Submap(NamedTuple):
+    """M_s of the paper: what it has learned, the box it governs, its keyframes and its pose."""
+
+    learned: mapping.Learned
+    box: Box
+    """Submap frame, metres."""
+    keyframes: tuple[Keyframe, ...]
+    """The first is the anchor, whose pose is the identity."""
+    T_world_sub: Pose
+    parent: int | None = None
+    """The submap whose keyframe its anchor is; None for the first, and where the camera had been lost."""
 
 
 class Record(NamedTuple):
-    """One processed frame. Its pose hangs on a keyframe, so that bundle adjustment moves it along."""
+    """One processed frame. Its pose hangs on a keyframe of a submap, so that bundle adjustment and loop closure move
+    it along."""
 
     frame: int
     """Number of the frame in the sequence on disk."""
     timestamp: float
+    submap: int
+    """Place of its submap in `SlamState.submaps`."""
     keyframe: int
-    """Place of its keyframe in `SlamState.keyframes`."""
+    """Place of its keyframe in that submap."""
     T_keyframe_cam: Pose
     status: Status
     info: FrameInfo
@@ -54,37 +80,94 @@ class FrameInfo(NamedTuple):
     """RO was run."""
     keyframe: bool = False
     map_steps: int = 0
+    submap: int = 0
+    """The active one."""
     track_ms: float = 0.0
     map_ms: float = 0.0
+    order_ms: float = 0.0
+    """Of keeping the submaps in order: boxes, links, loops, a new submap."""
     note: str = ""
+
+
+class Loop(NamedTuple):
+    """One loop that was found between two submaps, kept or rejected."""
+
+    frame: int
+    """Place of the frame that closed it in `SlamState.records`."""
+    first: int
+    """The submap the camera was in."""
+    second: int
+    """The submap that was seen again."""
+    how: How
+    """The frame lay in the other submap's box, or its image looked like one of the other's keyframes."""
+    inliers: float
+    """Share of the frame's pixels that fit the other submap, of those it knows."""
+    correction_m: float
+    """How far the pose graph moved the camera."""
+    correction_rad: float
+    weight: float
+    """1: kept; 0: rejected by the pose graph as false."""
 
 
 class SlamState(NamedTuple):
     """All that is known after a frame."""
 
-    submap: mapping.Submap
-    keyframes: tuple[Keyframe, ...]
-    """The first is the anchor."""
+    submaps: tuple[Submap, ...]
+    active: int
+    """The submap that the camera is tracked in."""
     records: tuple[Record, ...]
-    T_world_sub: Pose
     camera: Intrinsics
     trouble: int
     """Weak or lost frames in a row, up to now."""
+    loops: tuple[Loop, ...] = ()
+
+    @property
+    def submap(self) -> Submap:
+        """The active one."""
+        return self.submaps[self.active]
+
+    def with_submap(self, place: int, **fields: Any) -> SlamState:
+        """With fields of one submap replaced."""
+        submaps = list(self.submaps)
+        submaps[place] = submaps[place]._replace(**fields)
+        return self._replace(submaps=tuple(submaps))
 
 
 def pose_of(state: SlamState, record: Record) -> Pose:
-    """Camera-to-submap pose of a frame."""
-    return state.keyframes[record.keyframe].T_sub_cam @ record.T_keyframe_cam
+    """Camera-to-submap pose of a frame, in its own submap."""
+    return state.submaps[record.submap].keyframes[record.keyframe].T_sub_cam @ record.T_keyframe_cam
 
 
 def last_pose(state: SlamState) -> Pose:
-    """Camera-to-submap pose of the last frame."""
+    """Camera-to-submap pose of the last frame, which is always in the active submap."""
     return pose_of(state, state.records[-1])
+
+
+def world_pose(state: SlamState, record: Record) -> Pose:
+    """Camera-to-world pose of a frame."""
+    return state.submaps[record.submap].T_world_sub @ pose_of(state, record)
 
 
 def trajectory(state: SlamState) -> Float64[np.ndarray, "N 4 4"]:
     """World pose of every processed frame, camera-to-world."""
-    return np.stack([state.T_world_sub @ pose_of(state, record) for record in state.records])
+    return np.stack([world_pose(state, record) for record in state.records])
+
+
+def keyframes(state: SlamState) -> int:
+    """Different frames that are keyframes, of one submap or more."""
+    return len({keyframe.number for submap in state.submaps for keyframe in submap.keyframes})
+
+
+def map_bytes(state: SlamState) -> int:
+    """Size of the networks of all submaps."""
+    return sum(leaf.nbytes for submap in state.submaps for leaf in jax.tree.leaves(submap.learned.field))
+
+
+def inverse(T: Pose) -> Pose:
+    """Of a rigid motion."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
+    return out
 
 
 def rigid(T: Float[np.ndarray, "4 4"]) -> Pose:

@@ -6,7 +6,6 @@ import platform
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 import trimesh
 from jaxtyping import Float64
@@ -16,7 +15,7 @@ from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import InputError
 from mipsjax.host import metrics, surface
 from mipsjax.policy import Status
-from mipsjax.state import FrameInfo, SlamState, trajectory
+from mipsjax.state import FrameInfo, SlamState, keyframes, map_bytes, trajectory
 
 try:
     import resource
@@ -109,6 +108,7 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
     total = sum(stages.values())
     stages["track"] = sum(row.info.track_ms for row in rows) / 1e3
     stages["map"] = sum(row.info.map_ms for row in rows) / 1e3
+    stages["submaps"] = sum(row.info.order_ms for row in rows) / 1e3
     return {
         "schema_version": SCHEMA_VERSION,
         "status": verdict(rows),
@@ -117,12 +117,12 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
         "seconds": total,
         "seconds_per_stage": stages,
         "peak_memory_bytes": _peak_memory(),
-        "submaps": 1,
-        "keyframes": len(run.state.keyframes),
-        "loops": 0,
+        "submaps": len(run.state.submaps),
+        "keyframes": keyframes(run.state),
+        "loops": sum(loop.weight > 0 for loop in run.state.loops),
         "status_counts": {str(status): [row.status for row in rows].count(status) for status in Status},
         "ro_frames": sum(row.info.searched for row in rows),
-        "map_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(run.state.submap.field)),
+        "map_bytes": map_bytes(run.state),
         "bad_frames": [
             {"index": row.number, "reason": row.info.note}
             for row in rows

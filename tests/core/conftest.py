@@ -23,7 +23,7 @@ def corner_frames() -> mapping.Frames:
 
 
 @pytest.fixture(scope="session")
-def corner_map(corner_frames) -> mapping.Submap:
+def corner_map(corner_frames) -> mapping.Learned:
     """A submap that has learned the corner from the true poses."""
     fixed = corner_frames._replace(movable=np.zeros(len(corner.VIEWS), bool))
     key = jax.random.key(1)

@@ -147,7 +147,7 @@ def measured(T_sub_cam: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def other_map(corner_frames) -> mapping.Submap:
+def other_map(corner_frames) -> mapping.Learned:
     """The corner learned in another frame, from other parameters and draws."""
     moved = corner_frames._replace(
         T_sub_cam=(np.linalg.inv(T_WORLD_K) @ VIEWS).astype(np.float32), movable=np.zeros(len(VIEWS), bool)

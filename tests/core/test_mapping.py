@@ -27,7 +27,7 @@ def same_bits(a, b) -> bool:
 
 
 @pytest.fixture(scope="module")
-def fresh() -> mapping.Submap:
+def fresh() -> mapping.Learned:
     return mapping.create(jax.random.key(0), CFG)
 
 

@@ -88,7 +88,9 @@ def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg
     """
     start = _finite_or_zero(transform(T_k_j, surface_j.points))
     before = _local(field_k, start, cfg)
-    reached = (jnp.abs(before.psi) < SATURATED * cfg.field.truncation) & _certain(before.entropy, cfg)
+    reached = (jnp.abs(before.psi) < SATURATED * cfg.field.truncation) & nf.is_certain(
+        before.entropy, cfg.correspond.max_entropy, cfg.field
+    )
     q_k = _descend(field_k, start, cfg.correspond.match_steps, cfg)
     after = _local(field_k, q_k, cfg)
     normal_j = surface_j.normals @ T_k_j[:3, :3].T
@@ -131,14 +133,8 @@ def _on_surface(here: Local, cfg: Config) -> Bool[Array, " N"]:
     limits = cfg.correspond
     squared = jnp.sum(here.gradient**2, -1)
     plausible = (squared > limits.min_gradient**2) & (squared < limits.max_gradient**2)
-    return (jnp.abs(here.psi) < limits.max_distance) & plausible & _certain(here.entropy, cfg)
-
-
-def _certain(entropy: Float[Array, " N"], cfg: Config) -> Bool[Array, " N"]:
-    """All points of a field that is regressed, which has no entropy."""
-    if not cfg.field.classification:
-        return jnp.ones(entropy.shape, bool)
-    return entropy < cfg.correspond.max_entropy * np.log(cfg.field.classes)
+    certain = nf.is_certain(here.entropy, limits.max_entropy, cfg.field)
+    return (jnp.abs(here.psi) < limits.max_distance) & plausible & certain
 
 
 def _unit(vectors: Float[Array, "N 3"]) -> Float[Array, "N 3"]:

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mipsjax.config import FieldConfig
 
@@ -120,6 +120,13 @@ def classify(net: Net, encoded: Float[Array, "N E"], cfg: FieldConfig) -> Tsdf:
     log_p = jax.nn.log_softmax(cfg.coldness * z)
     p = jnp.exp(log_p)
     return Tsdf(p @ class_values(cfg), -jnp.sum(p * log_p, -1), log_p)
+
+
+def is_certain(entropy: Float[Array, " N"], share: float, cfg: FieldConfig) -> Bool[Array, " N"]:
+    """Entropy below a share of that of an even distribution; everywhere where the distance is regressed."""
+    if not cfg.classification:
+        return jnp.ones(entropy.shape, bool)
+    return entropy < share * np.log(cfg.classes)
 
 
 def frequencies(points: Float[Array, "N 3"], cfg: FieldConfig) -> Float[Array, "N E"]:

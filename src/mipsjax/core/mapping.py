@@ -24,8 +24,8 @@ from mipsjax.core.views import planes_at
 STEEPEST = 0.25  # least |n . ray|: normals at grazing angles are too uncertain for more
 
 
-class Submap(NamedTuple):
-    """The learned part of a submap; the same shapes for every submap of one config."""
+class Learned(NamedTuple):
+    """What a submap has learned; the same shapes for every submap of one config."""
 
     field: nf.Field
     optimizer: optax.OptState
@@ -65,26 +65,26 @@ def optimizer(cfg: Config) -> optax.GradientTransformation:
     return optax.adam(cfg.map.learning_rate, b1=cfg.map.momentum, b2=0.99)
 
 
-def create(key: PRNGKeyArray, cfg: Config) -> Submap:
+def create(key: PRNGKeyArray, cfg: Config) -> Learned:
     """A submap that knows nothing."""
     field = nf.init(key, cfg.field)
-    return Submap(field, optimizer(cfg).init(field))  # pyright: ignore[reportArgumentType]  (optax names no tuples, but takes any pytree)
+    return Learned(field, optimizer(cfg).init(field))  # pyright: ignore[reportArgumentType]  (optax names no tuples, but takes any pytree)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
 def refine(
-    submap: Submap,
+    learned: Learned,
     frames: Frames,
     steps: Int[Array, ""],
     key: PRNGKeyArray,
     camera: Intrinsics,
     cfg: Config,
     rate: Float[Array, ""] | float = 1.0,
-) -> tuple[Submap, Float[Array, "F 4 4"], MapInfo]:
+) -> tuple[Learned, Float[Array, "F 4 4"], MapInfo]:
     """`steps` steps of Adam on map and poses (Section 3.4 of the paper).
 
     `rate` is a share of the networks' learning rate.
-    Returns the submap, the poses and an info; all as before where anything became infinite or NaN.
+    Returns what was learned, the poses and an info; all as before where anything became infinite or NaN.
     """
     pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
     loss_and_gradient = jax.value_and_grad(map_loss, argnums=(0, 1))
@@ -102,11 +102,11 @@ def refine(
         return field, state, twist + pose_change, pose_state, loss
 
     twist = jnp.zeros((frames.depth.shape[0], 6))
-    start = (submap.field, submap.optimizer, twist, pose_optimizer.init(twist), jnp.zeros(()))
+    start = (learned.field, learned.optimizer, twist, pose_optimizer.init(twist), jnp.zeros(()))
     field, state, twist, _, loss = jax.lax.fori_loop(0, steps, step, start)
     ok = _finite((field, twist, loss))
-    submap = jax.tree.map(partial(jnp.where, ok), Submap(field, state), submap)
-    return submap, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
+    learned = jax.tree.map(partial(jnp.where, ok), Learned(field, state), learned)
+    return learned, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
 
 
 def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:

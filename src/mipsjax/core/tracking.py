@@ -292,6 +292,36 @@ def align(
     return jax.vmap(one)(depth, T)
 
 
+class Registration(NamedTuple):
+    """A frame in a submap that may or may not show what it sees."""
+
+    T_sub_cam: Float[Array, "4 4"]
+    overlap: Float[Array, ""]
+    """Share of measured pixels where the submap is certain of its distance."""
+    inliers: Float[Array, ""]
+    """Share of those that are within `keyframe.error` of its surface."""
+
+
+@partial(jax.jit, static_argnames=("camera", "cfg"))
+def register(
+    field: nf.Field,
+    depth: Float[Array, "H W"],
+    T: Float[Array, "4 4"],
+    camera: Intrinsics,
+    cfg: Config,
+) -> Registration:
+    """Second-order steps from a guess `T`, and what speaks for where they end. `depth` is at mapping size."""
+    color = jnp.zeros((*depth.shape, 3), jnp.uint8)
+    points = draw_points(jax.random.key(0), depth, color, cfg.track.go.pixels, camera)
+    T = levenberg_marquardt(field, T, points, "search", cfg.track.go.smooth_steps, cfg)
+    T = levenberg_marquardt(field, T, points, "whole", cfg.track.go.steps, cfg)
+    prediction = nf.tsdf(field, transform(T, points.p_cam), cfg.field)
+    certain = points.mask & nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)
+    near = (jnp.abs(prediction.psi) < cfg.keyframe.error).astype(jnp.float32)
+    overlap = losses.masked_mean(certain.astype(jnp.float32), points.mask)
+    return Registration(T, overlap, losses.masked_mean(near, certain))
+
+
 def search(
     field: nf.Field,
     depth: Float[Array, "H W"],

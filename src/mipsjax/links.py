@@ -1,0 +1,78 @@
+"""Frames that two submaps share: the measurements between submaps."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from mipsjax.config import Config
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse
+
+
+class Link(NamedTuple):
+    """One frame as a keyframe of two submaps."""
+
+    first: Keyframe
+    second: Keyframe
+
+    @property
+    def T_first_second(self) -> Pose:
+        """Pose of the second submap in the first, as this frame measures it."""
+        return self.first.T_sub_cam @ inverse(self.second.T_sub_cam)
+
+    @property
+    def reach(self) -> float:
+        """Metres from the frame to the two anchors: drift within a submap grows with it."""
+        return float(np.linalg.norm([k.T_sub_cam[:3, 3] for k in self]))
+
+
+def links(first: Submap, second: Submap) -> list[Link]:
+    """All of them, in the order of the first submap's keyframes."""
+    others = {keyframe.number: keyframe for keyframe in second.keyframes}
+    return [Link(k, others[k.number]) for k in first.keyframes if k.number in others]
+
+
+def best_link(first: Submap, second: Submap) -> Link | None:
+    """The one nearest to both anchors."""
+    return min(links(first, second), key=lambda link: link.reach, default=None)
+
+
+def linked_pairs(state: SlamState) -> list[tuple[int, int]]:
+    """Pairs of submaps, the lower place first, that share a frame."""
+    numbers = [{k.number for k in submap.keyframes} for submap in state.submaps]
+    count = len(numbers)
+    return [(j, k) for j in range(count) for k in range(j + 1, count) if numbers[j] & numbers[k]]
+
+
+def hops(state: SlamState, start: int) -> list[float]:
+    """Links to cross from one submap to each; infinite where none lead there."""
+    pairs = linked_pairs(state)
+    away = [float("inf")] * len(state.submaps)
+    away[start], queue = 0, deque([start])
+    while queue:
+        here = queue.popleft()
+        for pair in pairs:
+            if here in pair:
+                there = pair[1] if pair[0] == here else pair[0]
+                if away[there] == float("inf"):
+                    away[there] = away[here] + 1
+                    queue.append(there)
+    return away
+
+
+def sigmas(link: Link, cfg: Config) -> tuple[float, float]:
+    """Radians and metres by which a linked pose may be off, from the drift expected on the way to the anchors."""
+    loop = cfg.loop
+    turn, shift = loop.drift_rotation * link.reach, loop.drift * link.reach
+    return float(np.hypot(loop.sigma_rotation, turn)), float(np.hypot(loop.sigma, shift))
+
+
+def disagreement(state: SlamState, first: int, second: int, link: Link) -> float:
+    """Metres (or as many times 1 rad) between a frame's world poses by its two submaps."""
+    one, other = (
+        state.submaps[place].T_world_sub @ keyframe.T_sub_cam
+        for place, keyframe in zip((first, second), link, strict=True)
+    )
+    return max(distance(one, other))

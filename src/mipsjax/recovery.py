@@ -1,0 +1,41 @@
+"""A lost camera: found again in the map, or a new submap that is joined when it is seen to overlap."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mipsjax.closure import recognise
+from mipsjax.config import Config
+from mipsjax.state import Keyframe, Pose, SlamState, distance
+from mipsjax.territory import begin
+
+
+class Place(NamedTuple):
+    """Where a lost camera is."""
+
+    state: SlamState
+    """With the submap that knows what the frame sees as the active one."""
+    keyframe: int
+    """The nearest of its keyframes."""
+    T_sub_cam: Pose
+
+
+def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | None:
+    """The frame in any of the submaps, by its image; None where nothing fits."""
+    found = recognise(state, keyframe, list(range(len(state.submaps))), cfg)
+    if found is None:
+        return None
+    known = state.submaps[found.submap].keyframes
+    nearest = min(range(len(known)), key=lambda i: sum(distance(known[i].T_sub_cam, found.T_sub_cam)))
+    return Place(state._replace(active=found.submap), nearest, found.T_sub_cam)
+
+
+def start_anew(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place:
+    """A submap that hangs on nothing, placed where the camera was seen last until a loop joins it to the others."""
+    last = state.submap
+    pose = last.T_world_sub @ last.keyframes[state.records[-1].keyframe].T_sub_cam
+    submap, _ = begin(keyframe, [], pose, cfg.map.submap_steps, state.camera, cfg)
+    state = state._replace(submaps=(*state.submaps, submap), active=len(state.submaps))
+    return Place(state, 0, np.eye(4))

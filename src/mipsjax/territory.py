@@ -1,0 +1,138 @@
+"""Which submap a frame belongs to: boxes grow, submaps begin, old ones take over again (Algorithm 1 of the paper)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mipsjax.bundle import INIT, adjust, choose, mapping_camera, random_key, refine
+from mipsjax.config import Config
+from mipsjax.core import mapping, tracking, volume
+from mipsjax.core.camera import Intrinsics
+from mipsjax.policy import NEW, STAY, governor
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, inverse, rigid
+
+
+class Sighting(NamedTuple):
+    """A frame found in a submap other than the one it was tracked in."""
+
+    submap: int
+    T_sub_cam: Pose
+    inliers: float
+
+
+def begin(
+    anchor: Keyframe, support: list[Keyframe], T_world_sub: Pose, steps: int, camera: Intrinsics, cfg: Config
+) -> tuple[Submap, bool]:
+    """A submap from its anchor and a few keyframes near it, whose poses are relative to the anchor.
+
+    Returns it and whether its first fit stayed finite.
+    """
+    keyframes = (anchor._replace(T_sub_cam=np.eye(4)), *support)
+    learned = mapping.create(random_key(cfg, INIT, anchor.number), cfg)
+    batch = [keyframes[i % len(keyframes)] for i in range(cfg.map.frames)]
+    learned, _, ok = adjust(learned, batch, [0.0] * len(batch), steps, anchor.number, camera, cfg)
+    box = volume.grow(None, *_seen(keyframes[0], camera, cfg), cfg.volume)
+    return Submap(learned, box, keyframes, T_world_sub), ok
+
+
+def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
+    """After a new keyframe of the active submap: its box grows, the frame is offered to the submaps that see it.
+
+    Returns the sightings that became linked keyframes.
+    """
+    keyframe = state.submap.keyframes[-1]
+    p_cam, mask = volume.seen(keyframe.depth, mapping_camera(state.camera, cfg), cfg.volume)
+    state = state.with_submap(
+        state.active,
+        box=volume.grow(state.submap.box, volume.moved(keyframe.T_sub_cam, p_cam), mask, cfg.volume),
+    )
+    T_world_cam = state.submap.T_world_sub @ keyframe.T_sub_cam
+    sightings = []
+    for place, submap in enumerate(state.submaps):
+        guess = inverse(submap.T_world_sub) @ T_world_cam
+        inside = volume.contained(submap.box, volume.moved(guess, p_cam), mask)
+        if place == state.active or inside < cfg.loop.overlap:
+            continue
+        found = sight(state, place, keyframe, guess, cfg)
+        if found is not None:
+            state = link(state, keyframe, found)
+            sightings.append(found)
+    return state, sightings
+
+
+def sight(state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Config) -> Sighting | None:
+    """The frame in a submap, from a guess of its pose; None where it does not fit what the submap knows."""
+    small = mapping_camera(state.camera, cfg)
+    found = jax.device_get(
+        tracking.register(
+            state.submaps[place].learned.field,
+            jnp.asarray(keyframe.depth),
+            jnp.asarray(guess, jnp.float32),
+            small,
+            cfg,
+        )
+    )
+    fits = found.overlap >= cfg.loop.overlap and found.inliers >= cfg.loop.inliers
+    if not (np.isfinite(found.T_sub_cam).all() and fits):
+        return None
+    return Sighting(place, rigid(found.T_sub_cam), float(found.inliers))
+
+
+def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:
+    """The frame as a keyframe of the submap that it was found in."""
+    known = state.submaps[found.submap].keyframes
+    return state.with_submap(found.submap, keyframes=(*known, keyframe._replace(T_sub_cam=found.T_sub_cam)))
+
+
+def govern(state: SlamState, cfg: Config) -> SlamState:
+    """The submap that the camera is tracked in from here on: the same, an old one, or a new one."""
+    keyframe = state.submap.keyframes[-1]
+    p_cam, mask = volume.seen(keyframe.depth, mapping_camera(state.camera, cfg), cfg.volume)
+    shares = {}
+    for place, submap in enumerate(state.submaps):
+        last = submap.keyframes[-1]
+        if last.number == keyframe.number:
+            shares[place] = volume.contained(submap.box, volume.moved(last.T_sub_cam, p_cam), mask)
+    choice = governor(shares.pop(state.active), shares, cfg)
+    if choice == STAY:
+        return state
+    return _begin_here(state, cfg) if choice == NEW else _revisit(state, choice, cfg)
+
+
+def _begin_here(state: SlamState, cfg: Config) -> SlamState:
+    """A new submap whose anchor is the newest keyframe of the active one."""
+    old = state.submap
+    *before, anchor = old.keyframes
+    T_new_old = inverse(anchor.T_sub_cam)
+    support = [k._replace(T_sub_cam=T_new_old @ k.T_sub_cam) for k in before[::-1][: cfg.volume.support]]
+    T_world_sub = old.T_world_sub @ anchor.T_sub_cam
+    new, _ = begin(anchor, support, T_world_sub, cfg.map.submap_steps, state.camera, cfg)
+    new = new._replace(parent=state.active)
+    return moved_in(state._replace(submaps=(*state.submaps, new)), len(state.submaps), 0)
+
+
+def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
+    """An old submap takes over, after a few steps on the shared frame, so that tracking goes on smoothly."""
+    submap = state.submaps[place]
+    newest, number = len(submap.keyframes) - 1, submap.keyframes[-1].number
+    if cfg.map.revisit_steps:
+        known = submap._replace(keyframes=submap.keyframes[:-1])
+        others = choose(known, cfg.map.frames - 2, (cfg.seed, INIT, number))
+        submap, _ = refine(submap, [newest, *others], 1.0, cfg.map.revisit_steps, number, state.camera, cfg)
+    box = volume.grow(submap.box, *_seen(submap.keyframes[-1], state.camera, cfg), cfg.volume)
+    return moved_in(state.with_submap(place, **submap._replace(box=box)._asdict()), place, newest)
+
+
+def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
+    """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
+    last = state.records[-1]._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4))
+    return state._replace(active=place, records=(*state.records[:-1], last))
+
+
+def _seen(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> tuple[np.ndarray, np.ndarray]:
+    p_cam, mask = volume.seen(keyframe.depth, mapping_camera(camera, cfg), cfg.volume)
+    return volume.moved(keyframe.T_sub_cam, p_cam), mask
