@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from mipsjax.config import Config, GuardConfig, KeyframeConfig, MapConfig, SearchConfig, TrackConfig
-from mipsjax.policy import FrameStats, Status, decide, widening
+from mipsjax.policy import NEW, STAY, FrameStats, Status, decide, governor, widening
 
 CFG = Config(
     map=MapConfig(steps=10, steps_slow=4, motion=0.1),
@@ -95,3 +96,32 @@ def test_the_papers_spacing_of_keyframes():
 )
 def test_the_search_widens_with_trouble_up_to_a_limit(trouble, factor):
     assert widening(trouble, CFG) == pytest.approx(factor)
+
+
+@pytest.mark.parametrize(
+    ("active", "others", "expected"),
+    [
+        (0.9, {}, STAY),
+        (0.75, {1: 1.0}, STAY),  # as long as the active one holds enough, nothing changes
+        (0.74, {}, NEW),
+        (0.74, {1: 0.7}, NEW),  # an old submap that holds too little itself is no way out
+        (0.6, {1: 0.8, 2: 0.95}, 2),
+        (0.74, {1: 0.80}, STAY),  # able, but not by the hysteresis: wait, rather than take turns
+        (0.6, {3: 0.75}, 3),
+        (0.0, {0: 1.0}, 0),
+    ],
+)
+def test_which_submap_takes_over(active, others, expected):
+    assert governor(active, others, CFG) == expected
+
+
+def test_two_submaps_do_not_take_turns():
+    """Around the border either holds about as much: whoever is active stays so until the other is clearly better."""
+    here, switches = 0, 0
+    for share in 0.7 + 0.06 * np.sin(np.linspace(0, 40, 400)):
+        shares = {0: share, 1: 1.45 - share}
+        choice = governor(shares[here], {1 - here: shares[1 - here]}, CFG)
+        assert choice != NEW or max(shares.values()) < CFG.volume.overlap
+        if choice in (0, 1):
+            here, switches = choice, switches + 1
+    assert switches <= 1

@@ -1,0 +1,68 @@
+"""Shared frames of hand-made submaps: what they measure, and which submaps they connect."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from maps import keyframe, pose, state, submap
+from mipsjax import links
+from mipsjax.config import Config
+
+INF = float("inf")
+
+
+def test_a_shared_frame_measures_one_submap_in_the_other():
+    T_first_second = pose((5.0, -20.0, 3.0), (1.0, 0.2, -0.5))
+    T_second_cam = pose((0.0, 40.0, 0.0), (0.3, 0.0, 2.0))
+    first = submap(keyframe(0), keyframe(7, T_first_second @ T_second_cam))
+    second = submap(keyframe(7, T_second_cam), keyframe(9))
+    (found,) = links.links(first, second)
+    np.testing.assert_allclose(found.T_first_second, T_first_second, atol=1e-12)
+    (back,) = links.links(second, first)
+    np.testing.assert_allclose(back.T_first_second, np.linalg.inv(T_first_second), atol=1e-12)
+
+
+def test_the_best_link_is_nearest_to_both_anchors():
+    near, far = pose(translation=(0.5, 0.0, 0.0)), pose(translation=(0.0, 0.0, 4.0))
+    first = submap(keyframe(0), keyframe(1, far), keyframe(2, near), keyframe(3, near))
+    second = submap(keyframe(1, near), keyframe(2, far), keyframe(3, near))
+    best = links.best_link(first, second)
+    assert best is not None and best.first.number == 3
+    assert best.reach == pytest.approx(np.hypot(0.5, 0.5))
+    assert links.best_link(first, submap(keyframe(8))) is None
+
+
+def test_hops_count_links_along_the_shortest_way():
+    """A chain 0 - 1 - 2 - 3, a shortcut 0 - 2, and a submap on its own."""
+    given = state(
+        submap(keyframe(0), keyframe(1), keyframe(20)),
+        submap(keyframe(1), keyframe(2)),
+        submap(keyframe(2), keyframe(3), keyframe(20)),
+        submap(keyframe(3)),
+        submap(keyframe(4)),
+    )
+    assert links.linked_pairs(given) == [(0, 1), (0, 2), (1, 2), (2, 3)]
+    assert links.hops(given, 0) == [0, 1, 1, 2, INF]
+    assert links.hops(given, 4) == [INF, INF, INF, INF, 0]
+
+
+def test_doubt_grows_with_the_way_from_the_anchors():
+    cfg = Config()
+    at_anchor = links.Link(keyframe(0), keyframe(0))
+    turn, shift = links.sigmas(at_anchor, cfg)
+    assert (turn, shift) == (cfg.loop.sigma_rotation, cfg.loop.sigma)
+    away = links.Link(keyframe(0, pose(translation=(3.0, 0.0, 4.0))), keyframe(0))
+    farther = links.sigmas(away, cfg)
+    assert farther[1] == pytest.approx(np.hypot(cfg.loop.sigma, 5 * cfg.loop.drift))
+    assert farther[0] == pytest.approx(np.hypot(cfg.loop.sigma_rotation, 5 * cfg.loop.drift_rotation))
+
+
+def test_disagreement_is_between_world_poses():
+    T_cam = pose((0.0, 10.0, 0.0), (0.1, 0.0, 0.2))
+    moved = pose(translation=(0.03, 0.0, 0.0))
+    given = state(submap(keyframe(5, T_cam)), submap(keyframe(5), T_world_sub=moved @ T_cam))
+    (link,) = links.links(*given.submaps)
+    assert links.disagreement(given, 0, 1, link) == pytest.approx(0.03)
+    turned = given.with_submap(1, T_world_sub=T_cam @ pose((0.0, 0.0, 2.0)))
+    assert links.disagreement(turned, 0, 1, link) == pytest.approx(np.radians(2.0), rel=1e-4)
