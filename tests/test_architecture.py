@@ -21,7 +21,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"host", "data", "policy", "schedule"}),
     frozenset({"state"}),
     frozenset({"bundle", "links"}),
-    frozenset({"territory", "background"}),
+    frozenset({"territory", "background", "surfaces"}),
     frozenset({"closure"}),
     frozenset({"recovery"}),
     frozenset({"slam", "final"}),

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from mipsjax.bundle import MATCH, mapping_camera
+from mipsjax.bundle import MATCH
 from mipsjax.config import Config
-from mipsjax.core import correspond
-from mipsjax.host.factors import Factor, PointToPlane, RelativePose
+from mipsjax.host.factors import Factor
 from mipsjax.host.features import Features, similar
 from mipsjax.host.registration import relative_pose
-from mipsjax.links import Link, best_link, disagreement, hops, linked_pairs, links, sigmas
-from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, Submap, distance, last_pose
+from mipsjax.links import Link, disagreement, hops, linked_pairs
+from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
+from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
-
-EVERY = 3  # pixels between measured points from which surface points are sought
 
 
 def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Config) -> Sighting | None:
@@ -88,64 +83,27 @@ def solve(
     """Submap poses from all links and matched surfaces, and the weight of every linked pair. Fields stay as they are.
 
     Only `suspects`, pairs that met by a loop, may be rejected: all other links were seen from a pose that tracking
-    had brought there.
+    had brought there. They are judged by their shared frames alone, since surfaces that look alike match as well in
+    the wrong place; the surfaces of those that are kept then make them exact.
     """
     from mipsjax.host.posegraph import (
-        solve as solve_graph,
-    )  # gtsam takes a second to load; most runs need none
+        solve as solve_graph,  # gtsam takes a second to load; one submap needs none
+    )
 
-    pairs, factors, owner = linked_pairs(state), [], []
-    for pair in pairs:
-        for factor in _factors(state, *pair, pair not in suspects, cfg):
-            factors.append(factor)
-            owner.append(pair)
+    places = linked_pairs(state)
+    pairs = [
+        pair for place in places if (pair := pair_of(state.submaps[place[0]], state.submaps[place[1]], place))
+    ]
     poses = np.stack([submap.T_world_sub for submap in state.submaps])
-    found = solve_graph(poses, factors)
-    weights = {pair: 1.0 for pair in pairs}
-    for pair, weight in zip(owner, found.weights, strict=True):
-        weights[pair] = min(weights[pair], float(weight))
+    frames = [pose_factor(pair, pair.places not in suspects, cfg) for pair in pairs]
+    judged = solve_graph(poses, frames)
+    kept = [(pair, frame) for pair, frame, w in zip(pairs, frames, judged.weights, strict=True) if w]
+    factors: list[Factor] = [frame for _, frame in kept]
+    factors += [f for pair, _ in kept if (f := plane_factor(pair, True, state.camera, cfg)) is not None]
+    found = solve_graph(judged.T_world_sub, factors, robust=False)
     for place, pose in enumerate(found.T_world_sub):
         state = state.with_submap(place, T_world_sub=pose)
-    return state, weights
-
-
-def _factors(state: SlamState, j: int, k: int, trusted: bool, cfg: Config) -> list[Factor]:
-    """What is measured between two submaps: their best shared frame, and surfaces that both know around it."""
-    first, second = state.submaps[j], state.submaps[k]
-    shared = best_link(first, second)
-    assert shared is not None
-    turn, shift = sigmas(shared, cfg)
-    factors: list[Factor] = [RelativePose(j, k, shared.T_first_second, turn, shift, trusted)]
-    p_first, n_first, q_second = _matched(first, second, shared, state, cfg)
-    if len(p_first) >= cfg.loop.fewest_points:
-        sigma, count = cfg.loop.points_sigma, cfg.loop.effective_points
-        factors.append(PointToPlane(j, k, p_first, n_first, q_second, sigma, trusted, count))
-    return factors
-
-
-def _matched(
-    first: Submap, second: Submap, shared: Link, state: SlamState, cfg: Config
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-    """Surface points of the first submap in frames that both share, their normals, and the second's points."""
-    measured = np.concatenate([_unprojected(link.first, state, cfg) for link in links(first, second)])
-    start, mask = correspond.fixed_size(measured, cfg)
-    surface = correspond.surface_points(first.learned.field, start, mask, cfg)
-    T_second_first = jnp.asarray(np.linalg.inv(shared.T_first_second), jnp.float32)
-    matches = correspond.match(second.learned.field, T_second_first, surface, cfg)
-    surface, matches = jax.device_get((surface, matches))
-    kept = matches.mask
-    p, n, q = (np.asarray(a[kept], np.float64) for a in (surface.points, surface.normals, matches.q_k))
-    return p, n, q
-
-
-def _unprojected(keyframe: Keyframe, state: SlamState, cfg: Config) -> Float[np.ndarray, "N 3"]:
-    """Measured points of a keyframe, submap frame, metres; one in `EVERY` pixels each way is plenty."""
-    camera = mapping_camera(state.camera, cfg)
-    v, u = (x.ravel() for x in np.mgrid[0 : camera.height : EVERY, 0 : camera.width : EVERY])
-    depth = keyframe.depth[v, u].astype(np.float64)
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
-    p_cam = (ray * depth[:, None])[(depth > 0) & (depth < cfg.volume.far)]
-    return p_cam @ keyframe.T_sub_cam[:3, :3].T + keyframe.T_sub_cam[:3, 3]
+    return state, dict(zip(places, judged.weights.tolist(), strict=True))
 
 
 def _agrees(state: SlamState, place: int, cfg: Config) -> bool:

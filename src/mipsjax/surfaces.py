@@ -1,0 +1,110 @@
+"""Two submaps held together by the surfaces that both know: point-to-plane factors (Eqs. 19 and 20 of the paper)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from mipsjax.bundle import mapping_camera
+from mipsjax.config import Config
+from mipsjax.core import correspond, volume
+from mipsjax.core.camera import Intrinsics
+from mipsjax.host.factors import PointToPlane, RelativePose
+from mipsjax.links import Link, best_link, links, sigmas
+from mipsjax.state import Keyframe, Pose, Submap
+
+EVERY = 3  # pixels between the measured points from which surface points are sought
+ROUNDS = 4  # of matching and aligning: the pairs change as the submaps come closer
+MATCHED = 0.5  # least share of the points in the other's box: less is another surface that happens to be near
+
+
+class Pair(NamedTuple):
+    """Two submaps, and the frame that says best how they lie."""
+
+    first: Submap
+    second: Submap
+    link: Link
+    places: tuple[int, int]
+
+
+def pair_of(first: Submap, second: Submap, places: tuple[int, int]) -> Pair | None:
+    """None where they share no frame."""
+    link = best_link(first, second)
+    return None if link is None else Pair(first, second, link, places)
+
+
+def pose_factor(pair: Pair, trusted: bool, cfg: Config) -> RelativePose:
+    """What the shared frame measures (Eq. 21)."""
+    turn, shift = sigmas(pair.link, cfg)
+    return RelativePose(*pair.places, pair.link.T_first_second, turn, shift, trusted)
+
+
+def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> PointToPlane | None:
+    """What the surfaces measure, from the pose of the shared frame; None where too little of them meets.
+
+    Matching and aligning the two alone take turns: pairs found at the first pose need not be those of the last.
+    """
+    from mipsjax.host.posegraph import solve  # gtsam takes a second to load, and one submap needs none
+
+    surface = _surface(pair, camera, cfg)
+    prior = pose_factor(pair, True, cfg)._replace(first=0, second=1)
+    T, found = pair.link.T_first_second, None
+    for _ in range(ROUNDS):
+        found = _matched(pair, surface, T, cfg)
+        if found is None:
+            return None
+        T = solve(
+            np.stack([np.eye(4), T]), [prior, found._replace(first=0, second=1, trusted=True)]
+        ).T_world_sub[1]
+    if found is None or _misfit(found, T) > cfg.loop.points_sigma:
+        return None
+    return found._replace(trusted=trusted)
+
+
+def _surface(pair: Pair, camera: Intrinsics, cfg: Config) -> correspond.Surface:
+    """Of the first submap, in the frames that both share."""
+    measured = [_unprojected(link.first, camera, cfg) for link in links(pair.first, pair.second)]
+    start, mask = correspond.fixed_size(np.concatenate(measured), cfg)
+    return correspond.surface_points(pair.first.learned.field, jnp.asarray(start), jnp.asarray(mask), cfg)
+
+
+def _matched(
+    pair: Pair, surface: correspond.Surface, T_first_second: Pose, cfg: Config
+) -> PointToPlane | None:
+    T_second_first = np.linalg.inv(T_first_second)
+    matches = correspond.match(
+        pair.second.learned.field, jnp.asarray(T_second_first, jnp.float32), surface, cfg
+    )
+    points, normals, mask, q, met = jax.device_get((*surface, matches.q_k, matches.mask))
+    there = volume.inside(pair.second.box, volume.moved(T_second_first, points.astype(np.float64)))
+    expected = int((mask & there).sum())
+    if met.sum() < max(cfg.loop.fewest_points, MATCHED * expected):
+        return None
+    p, n, q = (_kept(rows, met) for rows in (points, normals, q))
+    return PointToPlane(
+        *pair.places, p, n, q, cfg.loop.points_sigma, effective_points=cfg.loop.effective_points
+    )
+
+
+def _kept(rows: np.ndarray, mask: Bool[np.ndarray, " N"]) -> Float64[np.ndarray, "M 3"]:
+    return rows[mask].astype(np.float64)
+
+
+def _misfit(factor: PointToPlane, T_first_second: Pose) -> float:
+    """Median distance across the surface, metres."""
+    q_first = volume.moved(T_first_second, factor.q_second)
+    return float(np.median(np.abs(np.sum((factor.p_first - q_first) * factor.n_first, 1))))
+
+
+def _unprojected(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> Float64[np.ndarray, "N 3"]:
+    """Measured points of a keyframe, submap frame, metres."""
+    small = mapping_camera(camera, cfg)
+    v, u = (x.ravel() for x in np.mgrid[0 : small.height : EVERY, 0 : small.width : EVERY])
+    depth = keyframe.depth[v, u].astype(np.float64)
+    ray = np.stack([(u - small.cx) / small.fx, (v - small.cy) / small.fy, np.ones(len(u))], 1)
+    p_cam = (ray * depth[:, None])[(depth > 0) & (depth < cfg.volume.far)]
+    return volume.moved(keyframe.T_sub_cam, p_cam)
