@@ -4,10 +4,11 @@
 
 The closed walk of `synth:apartment` is cut into 4, 6 or 10 submaps. Their networks learn exact depth from true poses,
 relative to the anchor. Each submap's anchor is also the last keyframe of the submap before: those shared frames carry
-a drift that adds up to exactly the given error (0.2 m and 5 degrees, 0.5 m and 10, 1 m and 20) around the ring. Then the last
-frame meets the first submap again: found by its image, verified in the field, linked, and the pose graph is solved as
-in a run. False loops are shared frames with poses 2 to 4 m and 30 to 120 degrees wrong. Errors are those of the last
-submap's pose ("end"), and the mean over all but the first. Writes `drift.csv`.
+a drift that adds up to exactly the given error (0.2 m and 5 degrees, 0.5 m and 10, 1 m and 20) around the ring. Then
+the last frame meets the first submap again: found by its image, verified in the field, linked, and the pose graph is
+solved as in a run. False loops are shared frames with poses 2 to 4 m and 30 to 120 degrees wrong (two in a ring of
+four, which has no more pairs for them). Errors are those of the last submap's pose ("end"), and the mean over all but
+the first. Writes `drift.csv`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def built(sequence: Sequence, count: int, cfg: Config) -> SlamState:
     truth = sequence.T_world_cam
     assert truth is not None
     borders = np.linspace(0, len(sequence) - 1, count + 1).astype(int)
-    submaps = [submap(sequence, *borders[i : i + 2], cfg) for i in range(count)]
+    submaps = [
+        submap(sequence, *borders[i : i + 2], cfg)._replace(parent=i - 1 if i else None) for i in range(count)
+    ]
     record = Record(0, 0.0, count - 1, 0, np.eye(4), Status.OK, FrameInfo())
     return SlamState(tuple(submaps), count - 1, (record,), sequence.intrinsics, 0)
 

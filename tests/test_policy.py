@@ -112,7 +112,12 @@ def test_the_search_widens_with_trouble_up_to_a_limit(trouble, factor):
     ],
 )
 def test_which_submap_takes_over(active, others, expected):
-    assert governor(active, others, CFG) == expected
+    assert governor(active, others, 1.0, CFG) == expected
+
+
+def test_a_view_that_fits_no_box_begins_no_submap_after_submap():
+    assert governor(0.6, {}, 0.65, CFG) == STAY
+    assert governor(0.5, {}, 0.65, CFG) == NEW
 
 
 def test_two_submaps_do_not_take_turns():
@@ -120,7 +125,7 @@ def test_two_submaps_do_not_take_turns():
     here, switches = 0, 0
     for share in 0.7 + 0.06 * np.sin(np.linspace(0, 40, 400)):
         shares = {0: share, 1: 1.45 - share}
-        choice = governor(shares[here], {1 - here: shares[1 - here]}, CFG)
+        choice = governor(shares[here], {1 - here: shares[1 - here]}, 1.0, CFG)
         assert choice != NEW or max(shares.values()) < CFG.volume.overlap
         if choice in (0, 1):
             here, switches = choice, switches + 1

@@ -91,9 +91,7 @@ def solve(
     )
 
     places = linked_pairs(state)
-    pairs = [
-        pair for place in places if (pair := pair_of(state.submaps[place[0]], state.submaps[place[1]], place))
-    ]
+    pairs = [pair_of(state.submaps, place) for place in places]
     poses = np.stack([submap.T_world_sub for submap in state.submaps])
     frames = [pose_factor(pair, pair.places not in suspects, cfg) for pair in pairs]
     judged = solve_graph(poses, frames)

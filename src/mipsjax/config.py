@@ -292,14 +292,15 @@ class LoopConfig:
     """Least share of a frame's pixels that the other submap must know for a link to it."""
     inliers: float = 0.8
     """Least share of these that must be within `keyframe.error` of its surface."""
-    drift: float = 0.01
-    """Metres of drift for each metre from the anchor: what a linked pose is worth in the pose graph."""
-    drift_rotation: float = 0.003
+    drift: float = 0.05
+    """Metres of drift for each metre from the anchor that a submap begun from another may hide: ten times what is
+    usual, since a true loop that comes after more drift than this would allow is rejected."""
+    drift_rotation: float = 0.015
     """Radians of drift for each metre from the anchor."""
-    sigma: float = 0.005
-    """Metres, the same at the anchor."""
-    sigma_rotation: float = 0.002
-    """Radians, the same at the anchor."""
+    sigma: float = 0.02
+    """Metres, of a frame that was registered in a submap, and of one at its anchor."""
+    sigma_rotation: float = 0.005
+    """Radians, the same."""
     fewest_points: int = 200
     """Matched surface points from which a pair of submaps is also held by them; below, by linked poses alone."""
     points_sigma: float = 0.01

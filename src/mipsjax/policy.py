@@ -67,17 +67,18 @@ def decide(stats: FrameStats, cfg: Config) -> Decision:
 STAY, NEW = -1, -2
 
 
-def governor(active: float, others: Mapping[int, float], cfg: Config) -> int:
+def governor(active: float, others: Mapping[int, float], fresh: float, cfg: Config) -> int:
     """Which submap takes over after a keyframe: STAY, NEW, or the place of an old one.
 
     `active` is the share of what the frame sees that lies in the active submap's box, `others` the same for those
-    that the frame was found in. A submap that takes over must hold more than the active one by the hysteresis.
+    that the frame was found in, `fresh` for one that would begin here (below 1 where a view does not fit into any
+    box). A submap that takes over must hold more than the active one by the hysteresis.
     """
     if active >= cfg.volume.overlap:
         return STAY
     able = {place: share for place, share in others.items() if share >= cfg.volume.overlap}
     if not able:
-        return NEW
+        return NEW if fresh >= active + cfg.volume.hysteresis else STAY
     best = max(able, key=able.__getitem__)
     return best if able[best] >= active + cfg.volume.hysteresis else STAY
 

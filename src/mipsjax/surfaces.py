@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -30,16 +31,27 @@ class Pair(NamedTuple):
     link: Link
     places: tuple[int, int]
 
+    @property
+    def chained(self) -> bool:
+        """One was begun from the other."""
+        return self.second.parent == self.places[0] or self.first.parent == self.places[1]
 
-def pair_of(first: Submap, second: Submap, places: tuple[int, int]) -> Pair | None:
-    """None where they share no frame."""
+
+def pair_of(submaps: Sequence[Submap], places: tuple[int, int]) -> Pair:
+    """Of two submaps that share a frame."""
+    first, second = (submaps[place] for place in places)
     link = best_link(first, second)
-    return None if link is None else Pair(first, second, link, places)
+    assert link is not None
+    return Pair(first, second, link, places)
 
 
 def pose_factor(pair: Pair, trusted: bool, cfg: Config) -> RelativePose:
-    """What the shared frame measures (Eq. 21)."""
-    turn, shift = sigmas(pair.link, cfg)
+    """What the shared frame measures (Eq. 21).
+
+    Along the chain of submaps it holds all the drift since the anchor. Elsewhere the frame was registered in a
+    submap that it did not drift in.
+    """
+    turn, shift = sigmas(pair.link, cfg) if pair.chained else (cfg.loop.sigma_rotation, cfg.loop.sigma)
     return RelativePose(*pair.places, pair.link.T_first_second, turn, shift, trusted)
 
 
@@ -47,9 +59,13 @@ def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> 
     """What the surfaces measure, from the pose of the shared frame; None where too little of them meets.
 
     Matching and aligning the two alone take turns: pairs found at the first pose need not be those of the last.
+    None along the chain, too: there tracking has brought the surfaces together, drift and all, and a factor as tight as
+    this would hold the drift where it is.
     """
     from mipsjax.host.posegraph import solve  # gtsam takes a second to load, and one submap needs none
 
+    if pair.chained:
+        return None
     surface = _surface(pair, camera, cfg)
     prior = pose_factor(pair, True, cfg)._replace(first=0, second=1)
     T, found = pair.link.T_first_second, None

@@ -97,7 +97,8 @@ def govern(state: SlamState, cfg: Config) -> SlamState:
         last = submap.keyframes[-1]
         if last.number == keyframe.number:
             shares[place] = volume.contained(submap.box, volume.moved(last.T_sub_cam, p_cam), mask)
-    choice = governor(shares.pop(state.active), shares, cfg)
+    fresh = volume.contained(volume.grow(None, p_cam, mask, cfg.volume), p_cam, mask)
+    choice = governor(shares.pop(state.active), shares, fresh, cfg)
     if choice == STAY:
         return state
     return _begin_here(state, cfg) if choice == NEW else _revisit(state, choice, cfg)

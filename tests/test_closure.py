@@ -1,0 +1,84 @@
+"""The pose graph of hand-made submaps, whose networks know nothing: shared frames alone."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from maps import keyframe, pose, state, submap
+from mipsjax.closure import solve
+from mipsjax.config import PRESETS
+from mipsjax.core import mapping
+from mipsjax.state import SlamState, distance
+
+CFG = PRESETS["tiny"]
+COUNT = 6
+STEP = pose((0.0, 360.0 / COUNT, 0.0), (2.0, 0.0, 1.0))
+"""From one submap of a ring to the next."""
+DRIFT = pose((0.5, -0.5, 0.5), (0.03, 0.02, -0.02))
+
+
+@pytest.fixture(scope="module")
+def ring() -> tuple[SlamState, list[np.ndarray]]:
+    """Six submaps whose chain drifts at every step, and the true poses. Frame 100 closes the ring exactly."""
+    learned = mapping.create(jax.random.key(0), CFG)
+    truth, drifted = [np.eye(4)], [np.eye(4)]
+    for _ in range(COUNT - 1):
+        truth.append(truth[-1] @ STEP)
+        drifted.append(drifted[-1] @ STEP @ DRIFT)
+    made = []
+    for place in range(COUNT):
+        shared = [keyframe(place + 1, STEP @ DRIFT)] if place < COUNT - 1 else []
+        new = submap(keyframe(place), *shared, T_world_sub=drifted[place], learned=learned)
+        made.append(new._replace(parent=place - 1 if place else None))
+    given = state(*made, active=COUNT - 1)
+    T_first_last = np.linalg.inv(truth[0]) @ truth[-1]
+    T_last_cam = pose((0.0, 5.0, 0.0), (0.1, 0.0, 0.1))
+    return closing(given, 0, COUNT - 1, 100, T_first_last @ T_last_cam, T_last_cam), truth
+
+
+def closing(given: SlamState, j: int, k: int, number: int, T_j_cam, T_k_cam) -> SlamState:
+    """With one more frame that two submaps share."""
+    for place, T in ((j, T_j_cam), (k, T_k_cam)):
+        keyframes = (*given.submaps[place].keyframes, keyframe(number, T))
+        given = given.with_submap(place, keyframes=keyframes)
+    return given
+
+
+def off(given: SlamState, truth: list[np.ndarray]) -> float:
+    """Metres by which the last submap is away from its true place."""
+    return distance(given.submaps[-1].T_world_sub, truth[-1])[0]
+
+
+def test_a_loop_takes_the_drift_away(ring):
+    given, truth = ring
+    before = off(given, truth)
+    assert before > 0.1
+    solved, weights = solve(given, {(0, COUNT - 1)}, CFG)
+    assert weights[0, COUNT - 1] == 1
+    assert off(solved, truth) < 0.1 * before  # the rest is what the loop's own sigma leaves to the chain
+    np.testing.assert_array_equal(solved.submaps[0].T_world_sub, np.eye(4))
+    for old, new in zip(given.submaps, solved.submaps, strict=True):
+        assert old.learned is new.learned and old.keyframes is new.keyframes, "submaps move as a whole"
+
+
+def test_a_false_loop_is_rejected_and_the_true_one_kept(ring):
+    given, truth = ring
+    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    solved, weights = solve(wrong, {(0, COUNT - 1), (1, 4)}, CFG)
+    assert weights[0, COUNT - 1] == 1 and weights[1, 4] == 0
+    assert off(solved, truth) < 0.1 * off(given, truth)
+
+
+def test_without_suspects_nothing_is_rejected(ring):
+    given, _ = ring
+    _, weights = solve(given, set(), CFG)
+    assert set(weights.values()) == {1.0}
+
+
+def test_a_submap_that_hangs_on_nothing_stays(ring):
+    given, _ = ring
+    alone = submap(keyframe(300), T_world_sub=pose(translation=(9.0, 0.0, 0.0)), learned=given.submap.learned)
+    solved, _ = solve(given._replace(submaps=(*given.submaps, alone)), {(0, COUNT - 1)}, CFG)
+    np.testing.assert_array_equal(solved.submaps[-1].T_world_sub, alone.T_world_sub)
