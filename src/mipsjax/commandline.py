@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -47,6 +47,8 @@ class Options:
     """Depth units per metre."""
     no_mesh: Flag = False
     """No mesh is made."""
+    no_loop: Flag = False
+    """No loop is closed: the same as --loop.no-enabled."""
     quiet: Flag = False
     """Prints nothing but errors."""
     inspect: Flag = False
@@ -63,6 +65,9 @@ def parse(arguments: list[str]) -> Options:
     early = _read(arguments, preset("default"))
     base = preset(early.preset)
     options = _read(arguments, base if early.config is None else read_toml(early.config, base))
+    if options.no_loop:
+        loop = replace(options.settings.loop, enabled=False)
+        options = replace(options, settings=replace(options.settings, loop=loop))
     validate(options.settings)
     parse_frames(options.frames)
     return options

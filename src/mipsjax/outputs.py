@@ -31,7 +31,7 @@ from mipsjax.host.meshing import export_ply
 from mipsjax.host.picture import save_picture, up_direction
 from mipsjax.options import to_dict
 from mipsjax.policy import Status
-from mipsjax.state import FrameInfo, trajectory
+from mipsjax.state import FrameInfo, SlamState, trajectory
 from mipsjax.summary import SCHEMA_VERSION, FrameRow, Run, metrics_content, verdict
 
 try:
@@ -46,7 +46,7 @@ FINISHED = ("metrics.json", "trajectory.txt", "mesh.ply")
 """A folder with one of these holds results."""
 PACKAGES = (
     "mipsjax", "jax", "jaxlib", "jaxlie", "optax", "numpy", "scipy", "opencv-python-headless", "trimesh",
-    "scikit-image",
+    "scikit-image", "gtsam",
 )  # fmt: skip
 """Whose versions can change a result."""
 
@@ -129,6 +129,7 @@ def write_results(
         save_picture(folder / "mesh.png", mesh, up_direction(poses))
     write_atomically(folder / "status.csv", status_csv(run.rows).encode())
     write_atomically(folder / "events.jsonl", events_jsonl(run, notes).encode())
+    write_json(folder / "loops.json", loops_content(run.state))
     content = metrics_content(run, mesh, seconds)
     write_json(folder / "metrics.json", content)
     return content
@@ -158,6 +159,24 @@ def write_config(folder: Path, cfg: Config, options: dict[str, Any], sequence: S
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes JSON in which NaN and infinity are null. Raises OutputError."""
     write_atomically(path, (json.dumps(_finite(content), indent=2, allow_nan=False) + "\n").encode())
+
+
+def loops_content(state: SlamState) -> dict[str, Any]:
+    """Every loop that was found, in order: between which submaps, how, and what became of it."""
+    loops = [
+        {
+            "index": state.records[loop.frame].frame,
+            "timestamp": state.records[loop.frame].timestamp,
+            "submaps": [loop.first, loop.second],
+            "how": loop.how,
+            "inliers": loop.inliers,
+            "weight": loop.weight,
+            "correction_cm": 100 * loop.correction_m,
+            "correction_deg": math.degrees(loop.correction_rad),
+        }
+        for loop in state.loops
+    ]
+    return {"schema_version": SCHEMA_VERSION, "loops": loops}
 
 
 def status_csv(rows: tuple[FrameRow, ...]) -> str:
