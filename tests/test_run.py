@@ -22,7 +22,7 @@ exported, program, sequence = running.exported, running.program, running.sequenc
 
 RESULTS = {
     "trajectory.txt", "trajectory_gt.txt", "mesh.ply", "mesh.png", "metrics.json", "config.json",
-    "status.csv", "events.jsonl",
+    "status.csv", "events.jsonl", "loops.json",
 }  # fmt: skip
 
 

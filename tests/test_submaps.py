@@ -1,0 +1,148 @@
+"""Several submaps in the host loop: begun, left, entered again, found again after the camera was lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import numpy as np
+import pytest
+
+from mipsjax import slam
+from mipsjax.config import PRESETS, Config, InputConfig, LoopConfig, VolumeConfig
+from mipsjax.data.sequence import Frame
+from mipsjax.data.synth import open_synth
+from mipsjax.final import finish
+from mipsjax.links import linked_pairs, links
+from mipsjax.policy import Status
+from mipsjax.reconstruct import reconstruct
+from mipsjax.state import SlamState, distance, trajectory, world_pose
+
+CFG = replace(
+    PRESETS["tiny"],
+    # Views cut short and boxes so small that two metres of motion need a second one
+    volume=VolumeConfig(max_side=2.0, far=1.2, overlap=0.8, hysteresis=0.05, support=2),
+    loop=LoopConfig(overlap=0.3, inliers=0.6),  # of a map that has learned little
+    map=replace(PRESETS["tiny"].map, steps=10, steps_slow=10),
+)
+FRAMES = 40  # 3.3 m
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return open_synth("room-fast", slice(FRAMES), InputConfig(working_width=80))
+
+
+@pytest.fixture(scope="module")
+def frames(sequence) -> list[Frame]:
+    """There and back again."""
+    there = [sequence[i] for i in range(FRAMES)]
+    both = there + there[-2::-1]
+    return [frame._replace(number=i, timestamp=i / 30) for i, frame in enumerate(both)]
+
+
+@pytest.fixture(scope="module")
+def truth(sequence) -> np.ndarray:
+    """Camera poses as seen from the first."""
+    poses = np.concatenate([sequence.T_world_cam, sequence.T_world_cam[-2::-1]])
+    return np.linalg.inv(poses[0]) @ poses
+
+
+def run(frames: list[Frame], camera, cfg: Config = CFG) -> list[SlamState]:
+    """The state after each frame."""
+    states = [slam.start(frames[0], camera, cfg)]
+    for frame in frames[1:]:
+        states.append(slam.step(states[-1], frame, cfg))
+    return states
+
+
+@pytest.fixture(scope="module")
+def states(frames, sequence) -> list[SlamState]:
+    return run(frames, sequence.intrinsics)
+
+
+def test_a_second_submap_begins_and_the_first_takes_over_again(states):
+    active = [state.active for state in states]
+    assert len(states[-1].submaps) == 2
+    assert active[0] == 0 and 1 in active and active[-1] == 0
+    changes = sum(a != b for a, b in pairwise(active))
+    assert changes == 2, "no taking turns at the border"
+    assert states[-1].submaps[1].parent == 0
+
+
+def test_no_pose_jumps_where_the_submap_changes(states, truth):
+    poses = np.stack([world_pose(state, state.records[-1]) for state in states])
+    error = poses[:, :3, 3] - truth[:, :3, 3]
+    # A tiny map is good to centimetres; where the submap changes it is no worse than elsewhere
+    assert np.linalg.norm(error, axis=1).max() < 0.06
+    jumps = np.linalg.norm(np.diff(error, axis=0), axis=1)
+    active = np.array([state.active for state in states])
+    assert jumps[active[1:] != active[:-1]].max() < max(0.02, np.quantile(jumps, 0.9))
+
+
+def test_submaps_share_frames_that_measure_how_they_lie(states):
+    state = states[-1]
+    assert linked_pairs(state) == [(0, 1)]
+    shared = links(*state.submaps)
+    T_first_second = np.linalg.inv(state.submaps[0].T_world_sub) @ state.submaps[1].T_world_sub
+    for link in shared:
+        metres, radians = distance(link.T_first_second, T_first_second)
+        assert metres < 0.05 and radians < 0.05
+    assert not state.loops, "two neighbours are no loop"
+
+
+def test_the_last_frame_is_always_in_the_active_submap(states):
+    for state in states:
+        assert state.records[-1].submap == state.active
+
+
+def test_boxes_keep_to_their_limit_and_anchors_to_the_origin(states):
+    for submap in states[-1].submaps:
+        assert (submap.box.hi - submap.box.lo <= CFG.volume.max_side + 1e-9).all()
+        np.testing.assert_array_equal(submap.keyframes[0].T_sub_cam, np.eye(4))
+
+
+def test_the_mesh_covers_both_submaps(states):
+    state = finish(states[-1], CFG)
+    assert len(trajectory(state)) == len(states)
+    both = reconstruct(state, CFG)
+    alone = [reconstruct(state._replace(submaps=(submap,)), CFG) for submap in state.submaps]
+    assert len(both.faces) > 0 and both.area > max(mesh.area for mesh in alone)
+
+
+def test_a_second_run_gives_the_same_bits_and_compiles_nothing(states, frames, sequence):
+    compiled: list[str] = []
+
+    def listen(event: str, duration: float, **details) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(str(details))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        again = run(frames, sequence.intrinsics)[-1]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not compiled, "a new submap and a switch compile nothing"
+    np.testing.assert_array_equal(trajectory(again), trajectory(states[-1]))
+    same = zip(*(jax.tree.leaves(s.submaps) for s in (again, states[-1])), strict=True)
+    assert all(np.array_equal(a, b) for a, b in same)
+
+
+def test_without_loops_submaps_stay_where_they_were_begun(frames, sequence):
+    cfg = replace(CFG, loop=replace(CFG.loop, enabled=False))
+    states = run(frames, sequence.intrinsics, cfg)
+    begun = next(state for state in states if len(state.submaps) == 2)
+    for one, other in zip(begun.submaps, states[-1].submaps, strict=True):
+        np.testing.assert_array_equal(one.T_world_sub, other.T_world_sub)
+
+
+def test_a_frame_of_nowhere_is_lost_or_never_trusted(states, frames):
+    """Depth of a wall 30 cm away, all in one colour: nothing of the map."""
+    color = np.full_like(frames[0].color, 90)
+    wall = frames[-1]._replace(
+        depth=np.full_like(frames[0].depth, 0.3), color=color, number=99, timestamp=99.0
+    )
+    after = slam.step(states[-1], wall, CFG)
+    assert after.records[-1].status is not Status.OK
+    assert len(after.submaps) == len(states[-1].submaps)
