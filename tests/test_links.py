@@ -33,18 +33,20 @@ def test_the_best_link_is_nearest_to_both_anchors():
     assert links.best_link(first, submap(keyframe(8))) is None
 
 
-def test_hops_count_links_along_the_shortest_way():
-    """A chain 0 - 1 - 2 - 3, a shortcut 0 - 2, and a submap on its own."""
-    given = state(
-        submap(keyframe(0), keyframe(1), keyframe(20)),
-        submap(keyframe(1), keyframe(2)),
-        submap(keyframe(2), keyframe(3), keyframe(20)),
-        submap(keyframe(3)),
-        submap(keyframe(4)),
-    )
-    assert links.linked_pairs(given) == [(0, 1), (0, 2), (1, 2), (2, 3)]
-    assert links.hops(given, 0) == [0, 1, 1, 2, INF]
-    assert links.hops(given, 4) == [INF, INF, INF, INF, 0]
+def test_pairs_that_share_a_frame():
+    given = state(submap(keyframe(0), keyframe(1), keyframe(20)), submap(keyframe(1)), submap(keyframe(20)))
+    assert links.linked_pairs(given) == [(0, 1), (0, 2)]
+
+
+def test_the_chain_is_made_of_submaps_begun_from_each_other():
+    """0 - 1 - 2 - 3, another 4 from 1, and 5 on its own; a frame that 0 and 3 share is no step."""
+    parents = [None, 0, 1, 2, 1, None]
+    made = [submap(keyframe(place))._replace(parent=parent) for place, parent in enumerate(parents)]
+    made[0], made[3] = (made[i]._replace(keyframes=(keyframe(i), keyframe(20))) for i in (0, 3))
+    given = state(*made)
+    assert links.chain_distances(given, 0) == [0, 1, 2, 3, 2, INF]
+    assert links.chain_distances(given, 3) == [3, 2, 1, 0, 3, INF]
+    assert links.chain_distances(given, 5) == [INF] * 5 + [0]
 
 
 def test_doubt_grows_with_the_way_from_the_anchors():

@@ -9,7 +9,7 @@ from mipsjax.config import Config
 from mipsjax.host.factors import Factor
 from mipsjax.host.features import Features, similar
 from mipsjax.host.registration import relative_pose
-from mipsjax.links import Link, disagreement, hops, linked_pairs
+from mipsjax.links import Link, chain_distances, disagreement, linked_pairs
 from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
@@ -17,9 +17,13 @@ from mipsjax.territory import Sighting, link, sight
 
 def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Config) -> Sighting | None:
     """The frame in one of some submaps, by its image: similar keyframes, matched features, then the field itself."""
-    stored = [
-        (place, k) for place in places for k in state.submaps[place].keyframes if k.features is not None
-    ]
+    once = {
+        k.number: (place, k)
+        for place in places
+        for k in state.submaps[place].keyframes
+        if k.features is not None
+    }
+    stored = list(once.values())  # a frame that several of them share counts once
     if keyframe.features is None or not stored:
         return None
     database: list[Features] = [k.features for _, k in stored if k.features is not None]
@@ -37,39 +41,36 @@ def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Conf
 def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: Config) -> SlamState:
     """After a new keyframe of the active submap: loops are looked for, and the pose graph is solved where it disagrees.
 
-    `sightings` are the submaps in whose box the frame was found, `before` the state without their links.
+    `sightings` are the submaps in whose box the frame was found, `before` the state without their links. A loop is a
+    first link between submaps that are far apart along the chain.
     """
-    keyframe = state.submap.keyframes[-1]
-    away = hops(before, before.active)
-    loops: list[tuple[Sighting, How]] = [
-        (found, "box") for found in sightings if away[found.submap] >= cfg.loop.apart
-    ]
+    keyframe, active = state.submap.keyframes[-1], state.active
+    away, linked = chain_distances(before, active), set(linked_pairs(before))
+    new = [p for p, n in enumerate(away) if n >= cfg.loop.apart and _pair(active, p) not in linked]
+    found: list[tuple[Sighting, How]] = [(sighting, "box") for sighting in sightings]
     if cfg.loop.features:
-        taken = {found.submap for found in sightings}
-        far = [p for p, n in enumerate(away) if n >= cfg.loop.apart and p not in taken]
-        found = recognise(state, keyframe, far, cfg)
-        if found is not None:
-            state = link(state, keyframe, found)
-            loops.append((found, "features"))
-    seen = [found.submap for found in sightings] + [found.submap for found, how in loops if how == "features"]
-    if not loops and all(_agrees(state, place, cfg) for place in seen):
+        taken = {sighting.submap for sighting in sightings}
+        recognised = recognise(state, keyframe, [p for p in new if p not in taken], cfg)
+        if recognised is not None:
+            state = link(state, keyframe, recognised)
+            found.append((recognised, "features"))
+    loops: list[tuple[Sighting, How]] = [pair for pair in found if pair[0].submap in new]
+    if not loops and all(_agrees(state, sighting.submap, cfg) for sighting, _ in found):
         return state
-    suspects = {_pair(loop.first, loop.second) for loop in state.loops}
-    suspects |= {_pair(state.active, found.submap) for found, _ in loops}
-    solved, weights = solve(state, suspects, cfg)
+    solved, weights = solve(state, cfg)
     moved = distance(_world(state), _world(solved))
     made = tuple(
         Loop(
             frame=keyframe.number,
-            first=state.active,
-            second=found.submap,
+            first=active,
+            second=sighting.submap,
             how=how,
-            inliers=found.inliers,
+            inliers=sighting.inliers,
             correction_m=moved[0],
             correction_rad=moved[1],
-            weight=weights[_pair(state.active, found.submap)],
+            weight=weights[_pair(active, sighting.submap)],
         )
-        for found, how in loops
+        for sighting, how in loops
     )
     for loop in made:
         if not loop.weight:
@@ -77,24 +78,22 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
     return solved._replace(loops=(*state.loops, *made))
 
 
-def solve(
-    state: SlamState, suspects: set[tuple[int, int]], cfg: Config
-) -> tuple[SlamState, dict[tuple[int, int], float]]:
+def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int], float]]:
     """Submap poses from all links and matched surfaces, and the weight of every linked pair. Fields stay as they are.
 
-    Only `suspects`, pairs that met by a loop, may be rejected: all other links were seen from a pose that tracking
-    had brought there. They are judged by their shared frames alone, since surfaces that look alike match as well in
-    the wrong place; the surfaces of those that are kept then make them exact.
+    Only pairs far apart along the chain may be rejected: all others were seen from a pose that tracking had brought
+    there. They are judged by their shared frames alone, since surfaces that look alike match as well in the wrong
+    place; the surfaces of those that are kept then make them exact.
     """
     from mipsjax.host.posegraph import (
-        solve as solve_graph,  # gtsam takes a second to load; one submap needs none
-    )
+        solve as solve_graph,
+    )  # gtsam takes a second to load, and may not be needed
 
     places = linked_pairs(state)
     pairs = [pair_of(state.submaps, place) for place in places]
-    poses = np.stack([submap.T_world_sub for submap in state.submaps])
-    frames = [pose_factor(pair, pair.places not in suspects, cfg) for pair in pairs]
-    judged = solve_graph(poses, frames)
+    near = {p: [n < cfg.loop.apart for n in chain_distances(state, p)] for p, _ in places}
+    frames = [pose_factor(pair, near[j][k], cfg) for pair, (j, k) in zip(pairs, places, strict=True)]
+    judged = solve_graph(np.stack([submap.T_world_sub for submap in state.submaps]), frames)
     kept = [(pair, frame) for pair, frame, w in zip(pairs, frames, judged.weights, strict=True) if w]
     factors: list[Factor] = [frame for _, frame in kept]
     factors += [f for pair, _ in kept if (f := plane_factor(pair, True, state.camera, cfg)) is not None]

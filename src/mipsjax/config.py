@@ -282,8 +282,9 @@ class LoopConfig:
     """A lost camera is looked for in all submaps; not in the paper."""
     patience: int = 60
     """Lost frames in a row after which a new submap is begun, that hangs on nothing until a loop joins it."""
-    apart: int = 4
-    """Links between two submaps, along the chain, from which meeting again counts as a loop."""
+    apart: int = 3
+    """Steps between two submaps, along the chain of those begun from each other, from which meeting again counts as a
+    loop and may be rejected as false: 3 are four submaps, as in the paper."""
     features: bool = True
     """Loops are also looked for by image features, not only in the box of a submap."""
     candidates: int = 3

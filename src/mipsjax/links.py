@@ -46,16 +46,21 @@ def linked_pairs(state: SlamState) -> list[tuple[int, int]]:
     return [(j, k) for j in range(count) for k in range(j + 1, count) if numbers[j] & numbers[k]]
 
 
-def hops(state: SlamState, start: int) -> list[float]:
-    """Links to cross from one submap to each; infinite where none lead there."""
-    pairs = linked_pairs(state)
+def chain_distances(state: SlamState, start: int) -> list[float]:
+    """Steps along the chain from one submap to each, each step from a submap to one that was begun from it or back.
+
+    Infinite between parts that were begun apart. Loops are no steps: what they join stays as far apart as it was.
+    """
+    steps = [
+        (place, submap.parent) for place, submap in enumerate(state.submaps) if submap.parent is not None
+    ]
     away = [float("inf")] * len(state.submaps)
     away[start], queue = 0, deque([start])
     while queue:
         here = queue.popleft()
-        for pair in pairs:
-            if here in pair:
-                there = pair[1] if pair[0] == here else pair[0]
+        for step in steps:
+            if here in step:
+                there = step[1] if step[0] == here else step[0]
                 if away[there] == float("inf"):
                     away[there] = away[here] + 1
                     queue.append(there)

@@ -173,6 +173,7 @@ NOT_BELOW = (
     ("field.truncation", "mesh.band"),
     ("guard.weak", "guard.lost"),
     ("correspond.max_gradient", "correspond.min_gradient"),
+    ("volume.margin", "blend.fade"),
 )
 """Pairs whose first field must not be below the second."""
 

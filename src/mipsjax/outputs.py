@@ -205,6 +205,8 @@ def events_jsonl(run: Run, notes: Iterable[str]) -> str:
             events.append({"event": "bad_frame", **where, "reason": row.info.note})
         elif row.info.note:
             events.append({"event": "note", **where, "text": row.info.note})
+        if row.info.found:
+            events.append({"event": f"found {row.info.found}", **where, "submap": row.info.submap})
         if last is Status.LOST and row.status in (Status.OK, Status.WEAK):
             events.append({"event": "recovered", **where})
         last = last if row.status is Status.SKIPPED else row.status

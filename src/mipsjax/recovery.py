@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
 
 from mipsjax.closure import recognise
 from mipsjax.config import Config
-from mipsjax.state import Keyframe, Pose, SlamState, distance
+from mipsjax.policy import Status
+from mipsjax.state import Keyframe, Pose, SlamState, distance, world_pose
 from mipsjax.territory import begin
 
 
@@ -32,10 +34,15 @@ def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | Non
     return Place(state._replace(active=found.submap), nearest, found.T_sub_cam)
 
 
+def lost_in_a_row(state: SlamState) -> int:
+    """Lost frames up to now; skipped ones between them do not count."""
+    tracked = (r.status for r in reversed(state.records) if r.status is not Status.SKIPPED)
+    return sum(1 for _ in takewhile(lambda status: status is Status.LOST, tracked))
+
+
 def start_anew(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place:
     """A submap that hangs on nothing, placed where the camera was seen last until a loop joins it to the others."""
-    last = state.submap
-    pose = last.T_world_sub @ last.keyframes[state.records[-1].keyframe].T_sub_cam
-    submap, _ = begin(keyframe, [], pose, cfg.map.submap_steps, state.camera, cfg)
+    last_seen = world_pose(state, state.records[-1])
+    submap, _ = begin(keyframe, [], last_seen, cfg.map.submap_steps, state.camera, cfg)
     state = state._replace(submaps=(*state.submaps, submap), active=len(state.submaps))
     return Place(state, 0, np.eye(4))

@@ -23,7 +23,7 @@ from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
 from mipsjax.policy import Decision, FrameStats, Status, decide, widening
-from mipsjax.recovery import find_again, start_anew
+from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.state import (
     FrameInfo,
     Keyframe,
@@ -91,18 +91,22 @@ def _recover(
     state: SlamState, frame: Frame, note: str, info: tracking.TrackInfo, track_ms: float, cfg: Config
 ) -> SlamState:
     """A lost frame: looked for in the whole map, after a while the anchor of a new submap, otherwise set aside."""
-    place = None
+    assert frame.depth is not None
+    place, found = None, ""
     if cfg.loop.relocalise and frame.color is not None:
         keyframe = _keyframe(frame, len(state.records), np.eye(4), cfg, state.camera)
         place = find_again(state, keyframe, cfg)
         if place is not None:
-            note = "found again"
-        elif state.trouble >= cfg.loop.patience:
-            place, note = start_anew(state, keyframe, cfg), "a new submap, not joined yet"
+            found = "again"
+        elif lost_in_a_row(state) >= cfg.loop.patience:
+            place, found = start_anew(state, keyframe, cfg), "nowhere"
     if place is None:
         return _coast(state, frame, note, Status.LOST, cfg, info, track_ms)
-    details = _info(info, track_ms)._replace(note=note, submap=place.state.active)
+    details = _info(info, track_ms)._replace(
+        found=found, submap=place.state.active, keyframe=found == "nowhere"
+    )
     record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
+    record = record._replace(depth=thumbnail(frame.depth, state.camera))
     return place.state._replace(records=(*state.records, record), trouble=1)
 
 
@@ -198,7 +202,8 @@ def _coast(
 ) -> SlamState:
     """A frame without a trusted pose stays where the camera was seen last; nothing is learned from it."""
     T_sub_cam = last_pose(state)
-    details = (FrameInfo() if info is None else _info(info, track_ms))._replace(note=note)
+    details = FrameInfo() if info is None else _info(info, track_ms)
+    details = details._replace(note=note, submap=state.active)
     record = _record(frame, state, T_sub_cam, status, details)
     return state._replace(records=(*state.records, record), trouble=state.trouble + 1)
 

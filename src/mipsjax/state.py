@@ -82,6 +82,8 @@ class FrameInfo(NamedTuple):
     map_steps: int = 0
     submap: int = 0
     """The active one."""
+    found: Literal["", "again", "nowhere"] = ""
+    """A lost camera was found in the map again, or began a submap that hangs on nothing yet."""
     track_ms: float = 0.0
     map_ms: float = 0.0
     order_ms: float = 0.0

@@ -123,7 +123,8 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
     if cfg.map.revisit_steps:
         known = submap._replace(keyframes=submap.keyframes[:-1])
         others = choose(known, cfg.map.frames - 2, (cfg.seed, INIT, number))
-        submap, _ = refine(submap, [newest, *others], 1.0, cfg.map.revisit_steps, number, state.camera, cfg)
+        share = cfg.map.pose_rate_slow
+        submap, _ = refine(submap, [newest, *others], share, cfg.map.revisit_steps, number, state.camera, cfg)
     box = volume.grow(submap.box, *_seen(submap.keyframes[-1], state.camera, cfg), cfg.volume)
     return moved_in(state.with_submap(place, **submap._replace(box=box)._asdict()), place, newest)
 
