@@ -18,6 +18,7 @@ import pytest
 
 import running
 from mipsjax import slam
+from mipsjax.core import tracking
 from mipsjax.state import SlamState
 from running import FRAMES, Program, Result, image, read, write
 
@@ -159,9 +160,9 @@ def test_14_nothing_usable(program: Program, sequence: Path) -> None:
 def test_15_hardly_any_pixel(program: Program, sequence: Path) -> None:
     keep = np.random.default_rng(0).random((60, 80)) < 0.01
     edit_depth(sequence, range(BAD, BAD + 1), lambda depth: np.where(keep, depth, 0).astype(np.uint16))
-    before = slam.tracking.track._cache_size()
+    before = tracking.track._cache_size()
     assert program(sequence).code == 0
-    assert slam.tracking.track._cache_size() <= before + 1
+    assert tracking.track._cache_size() <= before + 1
 
 
 def test_17_saturated_pixels(program: Program, sequence: Path) -> None:

@@ -14,6 +14,7 @@ import running
 from mipsjax import outputs, slam
 from mipsjax.commandline import parse
 from mipsjax.config import preset
+from mipsjax.core import mapping, tracking
 from mipsjax.data.trajectory import read_tum
 from running import FRAMES, Program
 
@@ -67,10 +68,10 @@ def test_synthetic_sequence_measures_its_mesh(program: Program) -> None:
 
 def test_nothing_compiles_anew_for_other_input_or_mesh_options(program: Program, exported: Path) -> None:
     program(exported, "--frames", ":3")
-    before = slam.tracking.track._cache_size(), slam.mapping.refine._cache_size()
+    before = tracking.track._cache_size(), mapping.refine._cache_size()
     options = ("--input.max-bad-frames", "7", "--mesh.voxel", "0.04")
     program(exported, "--frames", ":3", "--out", str(program.out) + "2", *options)
-    assert (slam.tracking.track._cache_size(), slam.mapping.refine._cache_size()) == before
+    assert (tracking.track._cache_size(), mapping.refine._cache_size()) == before
 
 
 def test_config_is_written_whole(program: Program, exported: Path) -> None:
