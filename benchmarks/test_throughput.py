@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from flops import matrix_flops
-from mipsjax.config import PRESETS, Config
+from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import mapping, particles, tracking
 from mipsjax.core.camera import Intrinsics, grid_shape
+from mipsjax.presets import PRESETS
 
 CAMERA = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 KEY = jax.random.key(0)

@@ -12,7 +12,8 @@ import argparse
 from typing import Any
 
 from common import DATA, changed, run, show, use_compilation_cache, write_rows
-from mipsjax.config import Config, preset
+from mipsjax.config import Config
+from mipsjax.presets import preset
 
 SYNTH = ("room-fast", "room-fast+noise+blur")
 

@@ -17,6 +17,7 @@ ROOT = Path(mipsjax.__file__).parent
 # From the left; a module imports only from layers before its own, and from its own package.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"errors", "config", "files"}),
+    frozenset({"presets"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
     frozenset({"state"}),
@@ -33,7 +34,6 @@ LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
 # Imports between neighbours of one layer that are meant. No cycle may come of them (tested below).
 NEIGHBOURS = {
     ("files", "errors"),  # a file that cannot be written raises OutputError
-    ("config", "errors"),  # validation raises ConfigError
     ("commandline", "options"),  # the command line is one source of options beside files and presets
     ("outputs", "options"),  # config.json holds the resolved options
     ("outputs", "summary"),  # metrics.json holds the run in numbers
@@ -126,7 +126,7 @@ def test_readers_use_only_the_camera_of_the_core(module):
 
 
 def test_config_and_errors_use_the_standard_library_alone():
-    for module in ("config", "errors"):
+    for module in ("config", "errors", "presets"):
         packages = {name.split(".")[0] for name in imported(SOURCES[module])} - {"mipsjax"}
         assert packages <= sys.stdlib_module_names, module
 

@@ -8,8 +8,8 @@ import pytest
 
 from maps import keyframe, pose, state, submap
 from mipsjax.closure import solve
-from mipsjax.config import PRESETS
 from mipsjax.core import mapping
+from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, distance
 
 CFG = PRESETS["tiny"]

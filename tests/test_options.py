@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mipsjax.config import PRESETS, Config, GuardConfig, InputConfig, preset
+from mipsjax.config import Config, GuardConfig, InputConfig
 from mipsjax.errors import ConfigError
 from mipsjax.options import RANGES, Range, flat, merged, read_toml, suggestion, to_dict, validate
+from mipsjax.presets import PRESETS, preset
 
 
 def numeric(value: object) -> bool:

@@ -16,7 +16,7 @@ import trimesh
 
 from mipsjax import outputs
 from mipsjax.bundle import make_keyframe
-from mipsjax.config import Config, preset
+from mipsjax.config import Config
 from mipsjax.core import mapping
 from mipsjax.core.volume import Box
 from mipsjax.data.open import open_sequence
@@ -24,6 +24,7 @@ from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import OutputError
 from mipsjax.files import write_atomically
 from mipsjax.policy import Status
+from mipsjax.presets import preset
 from mipsjax.reconstruct import observed_points, reconstruct
 from mipsjax.state import FrameInfo, Record, SlamState, Submap
 from mipsjax.summary import FrameRow, Run, metrics_content, verdict

@@ -13,9 +13,9 @@ import mipsjax
 import running
 from mipsjax import outputs, slam
 from mipsjax.commandline import parse
-from mipsjax.config import preset
 from mipsjax.core import mapping, tracking
 from mipsjax.data.trajectory import read_tum
+from mipsjax.presets import preset
 from running import FRAMES, Program
 
 # Fixtures: as assignments, so that parameters of the same name are no redefinitions of an import

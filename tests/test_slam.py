@@ -8,12 +8,14 @@ import jax
 import numpy as np
 import pytest
 
+from compilations import compilations
 from mipsjax import slam
-from mipsjax.config import PRESETS, InputConfig
+from mipsjax.config import InputConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
 from mipsjax.policy import Status
+from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, trajectory
 
 CFG = PRESETS["tiny"]
@@ -77,22 +79,13 @@ def test_the_first_pose_is_the_one_asked_for(frames, sequence, finished):
 
 
 def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, sequence, finished):
-    compiled: list[str] = []
-
-    def listen(event: str, duration: float, **details) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(str(details))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         again = run(frames, sequence.intrinsics)
         blind = slam.step(again, frames[0]._replace(depth=None, problem="gone"), CFG)
         slam.step(blind, frames[5]._replace(color=None), CFG)
         assert not compiled
         jax.jit(lambda x: x * 7)(np.float32(1))
         assert compiled, "the listener hears compilations"
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     np.testing.assert_array_equal(trajectory(again), trajectory(finished))
     assert same_map(again, finished)
 

@@ -9,13 +9,15 @@ import jax
 import numpy as np
 import pytest
 
+from compilations import compilations
 from mipsjax import slam
-from mipsjax.config import PRESETS, Config, InputConfig, LoopConfig, VolumeConfig
+from mipsjax.config import Config, InputConfig, LoopConfig, VolumeConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
 from mipsjax.links import linked_pairs, links
 from mipsjax.policy import Status
+from mipsjax.presets import PRESETS
 from mipsjax.reconstruct import reconstruct
 from mipsjax.state import SlamState, distance, trajectory, world_pose
 
@@ -112,17 +114,8 @@ def test_the_mesh_covers_both_submaps(states):
 
 
 def test_a_second_run_gives_the_same_bits_and_compiles_nothing(states, frames, sequence):
-    compiled: list[str] = []
-
-    def listen(event: str, duration: float, **details) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(str(details))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         again = run(frames, sequence.intrinsics)[-1]
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert not compiled, "a new submap and a switch compile nothing"
     np.testing.assert_array_equal(trajectory(again), trajectory(states[-1]))
     same = zip(*(jax.tree.leaves(s.submaps) for s in (again, states[-1])), strict=True)

@@ -20,9 +20,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mipsjax.config import PRESETS as PRESETS
     from mipsjax.config import Config as Config
-    from mipsjax.config import preset as preset
     from mipsjax.core.camera import Intrinsics as Intrinsics
     from mipsjax.core.mapping import Learned as Learned
     from mipsjax.core.mapping import refine as refine
@@ -39,6 +37,8 @@ if TYPE_CHECKING:
     from mipsjax.final import finish as finish
     from mipsjax.options import validate as validate
     from mipsjax.policy import Status as Status
+    from mipsjax.presets import PRESETS as PRESETS
+    from mipsjax.presets import preset as preset
     from mipsjax.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
     from mipsjax.slam import start as start
     from mipsjax.slam import step as step
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 # `reconstruct_mesh` is not named after its function, since a package attribute cannot be both that function
 # and the module it is in.
 _PLACES = {
-    "PRESETS": "config:PRESETS",
+    "PRESETS": "presets:PRESETS",
     "Config": "config:Config",
     "ConfigError": "errors:ConfigError",
     "Frame": "data.sequence:Frame",
@@ -67,7 +67,7 @@ _PLACES = {
     "TrackingLostError": "errors:TrackingLostError",
     "fitness": "core.particles:fitness",
     "open_sequence": "data.open:open_sequence",
-    "preset": "config:preset",
+    "preset": "presets:preset",
     "reconstruct_mesh": "reconstruct:reconstruct",
     "refine": "core.mapping:refine",
     "finish": "final:finish",

@@ -11,10 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from mipsjax.config import PRESETS, Config, preset
+from mipsjax.config import Config
 from mipsjax.data.open import parse_frames
 from mipsjax.errors import ConfigError
 from mipsjax.options import flat, read_toml, suggestion, validate
+from mipsjax.presets import PRESETS, preset
 
 PROGRAM = "python -m mipsjax.run"
 # An option that is given or not; the other switches have a `no-` form too

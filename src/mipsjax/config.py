@@ -1,4 +1,4 @@
-"""Configuration: frozen dataclasses, presets and validation.
+"""Configuration: frozen dataclasses.
 
 Every number of the method is a field here. The `paper` preset holds the numbers of MIPS-Fusion (SIGGRAPH Asia
 2023); where the paper gives none, and where a departure is better on two CPU cores, the docstring says why.
@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
-
-from mipsjax.errors import ConfigError
 
 Encoding = Literal["frequency", "hash", "joint", "both"]
 
@@ -386,59 +384,3 @@ class Config:
     blend: BlendConfig = BlendConfig()
     mesh: MeshConfig = MeshConfig()
     seed: int = 0
-
-
-def preset(name: str) -> Config:
-    """One of PRESETS."""
-    if name not in PRESETS:
-        raise ConfigError(f"unknown preset '{name}'; there are {', '.join(PRESETS)}")
-    return PRESETS[name]
-
-
-PAPER = Config(
-    field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
-    sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
-    loss=LossConfig(cross_entropy=0.0, cross_entropy_free=0.0, color_samples=50),
-    map=MapConfig(
-        steps=15,
-        steps_slow=15,
-        pose_rate_slow=1.0,
-        first_steps=500,
-        submap_steps=500,
-        final_steps=0,
-        pixels=384,
-        momentum=0.9,
-        pose_learning_rate=1e-3,
-    ),
-    track=TrackConfig(
-        ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
-        go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
-    ),
-    keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
-    volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
-    background=BackgroundConfig(every_frames=1, pose_rate=1.0),
-    loop=LoopConfig(relocalise=False),
-    blend=BlendConfig(fade=0.0),
-)
-TINY = Config(
-    field=FieldConfig(
-        hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
-    ),
-    sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
-    loss=LossConfig(cross_entropy_free=3.0),
-    map=MapConfig(
-        pose_learning_rate=1e-3,
-        steps=4,
-        steps_slow=4,
-        first_steps=60,
-        submap_steps=60,
-        final_steps=40,
-        pixels=64,
-    ),
-    track=TrackConfig(
-        ro=SearchConfig(particles=128, pixels=48, steps=4),
-        go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
-    ),
-    mesh=MeshConfig(voxel=0.05),
-)
-PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

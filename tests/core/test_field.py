@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from mipsjax.config import PRESETS, FieldConfig
+from mipsjax.config import FieldConfig
 from mipsjax.core import field as nf
+from mipsjax.presets import PRESETS
 
 SMALL = FieldConfig(
     encoding="both",

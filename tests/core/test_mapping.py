@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from corner import CAMERA, CFG, VIEWS, apart, pose
 
+from compilations import compilations
 from mipsjax.core import mapping
 
 KEY = jax.random.key(2)
@@ -85,20 +86,11 @@ def test_poses_stay_rigid(corner_map, jolted):
 
 def test_any_number_of_steps_shares_one_compilation(fresh, corner_frames):
     refine(fresh, corner_frames, 1)
-    compiled = []
-
-    def listen(event: str, duration: float, **_) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         three, five = (refine(fresh, corner_frames, n) for n in (3, 5))
         assert not compiled
         jax.jit(lambda x: x * 3)(np.float32(1))
         assert compiled, "the listener hears compilations"
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert not same_bits(three[0], five[0])
 
 
