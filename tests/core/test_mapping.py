@@ -35,10 +35,7 @@ def fresh() -> mapping.Learned:
 @pytest.fixture(scope="module")
 def loss():
     """The mapping loss on a fixed draw, as a function of the field and the frames."""
-    zero = jnp.zeros((len(VIEWS), 6))
-    return jax.jit(
-        lambda field, frames: mapping.map_loss(field, zero, frames.T_sub_cam, frames, KEY, CAMERA, CFG)
-    )
+    return jax.jit(lambda field, frames: mapping.map_loss(field, frames, KEY, CAMERA, CFG)[0])
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +57,17 @@ def test_the_loss_decreases(fresh, corner_map, corner_frames, loss):
     assert bool(info.ok) and np.isfinite(info.loss)
     assert float(loss(after.field, corner_frames)) < 0.5 * before
     assert float(loss(corner_map.field, corner_frames)) < float(loss(after.field, corner_frames))
+
+
+def test_the_gradient_does_not_depend_on_the_chunks(fresh, corner_frames, monkeypatch):
+    def gradient():
+        return jax.jit(lambda field: mapping.map_loss(field, corner_frames, KEY, CAMERA, CFG))(fresh.field)
+
+    whole = gradient()
+    monkeypatch.setattr(mapping, "CHUNK_SAMPLES", 300)
+    assert mapping.draw(fresh.field, corner_frames, KEY, CAMERA, CFG).frame.shape[0] > 5
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(gradient()), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
 
 
 def test_poses_are_corrected_and_the_anchor_stays(corner_map, jolted):

@@ -21,6 +21,7 @@ from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
 from mipsjax.core.views import planes_at
 
+CHUNK_SAMPLES = 12_000  # of which the activations stay in a core's cache
 STEEPEST = 0.25  # least |n . ray|: normals at grazing angles are too uncertain for more
 
 
@@ -49,6 +50,22 @@ class Pixels(NamedTuple):
     depth: Float[Array, " P"]
     slope: Float[Array, " P"]
     color: Float[Array, "P 3"]
+
+
+class Batch(NamedTuple):
+    """R rays of several frames, with S samples each."""
+
+    frame: Int[Array, " R"]
+    pixels: Pixels
+    samples: sampling.Samples
+
+
+class Totals(NamedTuple):
+    """Over how many samples and rays of a whole draw each loss is a mean."""
+
+    near: Float[Array, ""]
+    free: Float[Array, ""]
+    measured: Float[Array, ""]
 
 
 class MapInfo(NamedTuple):
@@ -87,14 +104,12 @@ def refine(
     Returns what was learned, the poses and an info; all as before where anything became infinite or NaN.
     """
     pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
-    loss_and_gradient = jax.value_and_grad(map_loss, argnums=(0, 1))
 
     def step(i, carry):
         field, state, twist, pose_state, _ = carry
-        poses = moved(frames, twist)
         k = jax.random.fold_in(key, i)
-        loss, (g_field, g_twist) = loss_and_gradient(
-            field, jnp.zeros_like(twist), poses, frames, k, camera, cfg
+        loss, (g_field, g_twist) = map_loss(
+            field, frames._replace(T_sub_cam=moved(frames, twist)), k, camera, cfg
         )
         change, state = optimizer(cfg).update(g_field, state, field)
         pose_change, pose_state = pose_optimizer.update(g_twist, pose_state)
@@ -119,61 +134,99 @@ def perturb(poses: Float[Array, "F 4 4"], twist: Float[Array, "F 6"]) -> Float[A
 
 
 def map_loss(
-    field: nf.Field,
-    twist: Float[Array, "F 6"],
-    poses: Float[Array, "F 4 4"],
-    frames: Frames,
-    key: PRNGKeyArray,
-    camera: Intrinsics,
-    cfg: Config,
-) -> Float[Array, ""]:
-    """The mapping loss on one draw of pixels and samples of every frame (Eq. 18)."""
+    field: nf.Field, frames: Frames, key: PRNGKeyArray, camera: Intrinsics, cfg: Config
+) -> tuple[Float[Array, ""], tuple[nf.Field, Float[Array, "F 6"]]]:
+    """The mapping loss on one draw of pixels and samples of every frame (Eq. 18), and its gradient.
+
+    The gradient is that for the networks and for a twist (v, omega) of each frame, and is summed over chunks of
+    rays: the losses are means over the whole draw, so their normalisers are counted before.
+    """
+    chunks = draw(field, frames, key, camera, cfg)
+    measured = chunks.pixels.depth > 0
+    totals = Totals(*(_count(mask) for mask in (chunks.samples.near, chunks.samples.free, measured)))
+    loss_and_gradient = jax.value_and_grad(_share_of_loss, argnums=(0, 1))
+    twist = jnp.zeros((frames.depth.shape[0], 6))
+
+    def add(total, chunk):
+        return jax.tree.map(jnp.add, total, loss_and_gradient(field, twist, frames, chunk, totals, cfg)), None
+
+    nothing = jax.tree.map(jnp.zeros_like, (totals.near, (field, twist)))
+    return jax.lax.scan(add, nothing, chunks)[0]
+
+
+def draw(field: nf.Field, frames: Frames, key: PRNGKeyArray, camera: Intrinsics, cfg: Config) -> Batch:
+    """Pixels of every frame and samples on their rays, with a leading axis of chunks."""
     count = frames.depth.shape[0]
     k_pixels, k_rays, k_surface = jax.random.split(key, 3)
     pixels = jax.vmap(draw_pixels, (0, 0, 0, None, None))(
         jax.random.split(k_pixels, count), frames.depth, frames.color, camera, cfg
     )
-    flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), pixels)
-    poses = perturb(poses, twist * frames.movable[:, None])
-    per_frame = flat.depth.shape[0] // count
-    rotation, origin = jnp.repeat(poses[:, :3, :3], per_frame, 0), jnp.repeat(poses[:, :3, 3], per_frame, 0)
-    ray_sub = jnp.einsum("pij,pj->pi", rotation, flat.ray)
+    frame = jnp.repeat(jnp.arange(count), pixels.depth.shape[1])
+    pixels = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), pixels)
+    depth = sampling.first_phase(k_rays, pixels.depth, cfg.field.truncation, cfg.sample)
+    chunks = _chunks(len(frame), depth.shape[1] + cfg.sample.surface)
 
-    def at(depth):
-        return (origin[:, None] + depth[..., None] * ray_sub[:, None]).reshape(-1, 3)
+    def finish(chunk):
+        key, frame, pixels, depth = chunk
 
-    tau = cfg.field.truncation
-    depth = sampling.first_phase(k_rays, flat.depth, tau, cfg.sample)
-    depth = sampling.second_phase(
-        k_surface, depth, lambda d: nf.tsdf(field, at(d), cfg.field).psi.reshape(d.shape), cfg.sample
-    )
-    samples = sampling.label(depth, flat.depth, flat.slope, tau)
-    points = at(depth)
-    total = jnp.zeros(())
+        def distance(depth):
+            points = _points(frames.T_sub_cam, frame, pixels, depth)
+            return nf.tsdf(field, points, cfg.field).psi.reshape(depth.shape)
+
+        depth = sampling.second_phase(key, depth, distance, cfg.sample)
+        return Batch(frame, pixels, sampling.label(depth, pixels.depth, pixels.slope, cfg.field.truncation))
+
+    rays = jax.tree.map(lambda a: a.reshape(chunks, -1, *a.shape[1:]), (frame, pixels, depth))
+    return jax.lax.map(finish, (jax.random.split(k_surface, chunks), *rays))
+
+
+def _chunks(rays: int, samples: int) -> int:
+    """The least number of equal chunks of which none is too large."""
+    return next(n for n in range(1, rays + 1) if rays % n == 0 and rays // n * samples <= CHUNK_SAMPLES)
+
+
+def _points(
+    poses: Float[Array, "F 4 4"], frame: Int[Array, " R"], pixels: Pixels, depth: Float[Array, "R S"]
+) -> Float[Array, "RS 3"]:
+    """The samples in the submap's frame."""
+    ray = jnp.einsum("rij,rj->ri", poses[frame, :3, :3], pixels.ray)
+    return (poses[frame, None, :3, 3] + depth[..., None] * ray[:, None]).reshape(-1, 3)
+
+
+def _share_of_loss(
+    field: nf.Field, twist: Float[Array, "F 6"], frames: Frames, batch: Batch, totals: Totals, cfg: Config
+) -> Float[Array, ""]:
+    """What a batch adds to the loss of the whole draw."""
+    points = _points(moved(frames, twist), batch.frame, batch.pixels, batch.samples.depth)
+    total, finest = jnp.zeros(()), None
     if field.smooth is not None:
-        total += tsdf_loss(nf.smooth_tsdf(field, points, cfg.field), samples, cfg)
+        finest = nf.smooth_tsdf(field, points, cfg.field)
+        total += tsdf_loss(finest, batch.samples, totals, cfg)
         # Where there is a smooth field, it alone moves the poses: derivatives through the hash grid cost more
         # than the rest of the step.
         points = jax.lax.stop_gradient(points)
     encoded = nf.encode(field, points, cfg.field)
-    net = field.smooth if field.fine is None else field.fine
-    assert net is not None
-    prediction = nf.classify(net, encoded, cfg.field)
     if field.fine is not None:
-        total += tsdf_loss(prediction, samples, cfg)
-    return total + cfg.loss.rgb * color_loss(field, prediction.psi, encoded, samples, flat, cfg)
+        finest = nf.classify(field.fine, encoded, cfg.field)
+        total += tsdf_loss(finest, batch.samples, totals, cfg)
+    assert finest is not None
+    return total + cfg.loss.rgb * color_loss(field, finest.psi, encoded, batch, totals, cfg)
 
 
-def tsdf_loss(prediction: nf.Tsdf, samples: sampling.Samples, cfg: Config) -> Float[Array, ""]:
+def tsdf_loss(
+    prediction: nf.Tsdf, samples: sampling.Samples, totals: Totals, cfg: Config
+) -> Float[Array, ""]:
+    """What samples of a draw add to the losses of a distance field (Eqs. 9 to 11)."""
     target = samples.target.reshape(-1)
+    near = (cfg.loss.tr, cfg.loss.cross_entropy, samples.near, totals.near)
+    free = (cfg.loss.fs, cfg.loss.cross_entropy_free, samples.free, totals.free)
     total = jnp.zeros(())
-    near = (cfg.loss.tr, cfg.loss.cross_entropy, samples.near)
-    free = (cfg.loss.fs, cfg.loss.cross_entropy_free, samples.free)
-    for squared, entropy, mask in (near, free):
+    for squared, entropy, mask, of in (near, free):
         flat = mask.reshape(-1)
-        total += squared * losses.distance(prediction.psi, target, flat)
-        total += cfg.loss.emd * losses.emd(prediction, target, flat, cfg.field)
-        total += entropy * losses.cross_entropy(prediction, target, flat, cfg.field)
+        mean = squared * losses.distance(prediction.psi, target, flat)
+        mean += cfg.loss.emd * losses.emd(prediction, target, flat, cfg.field)
+        mean += entropy * losses.cross_entropy(prediction, target, flat, cfg.field)
+        total += mean * (_count(mask) / of)
     return total
 
 
@@ -181,18 +234,25 @@ def color_loss(
     field: nf.Field,
     psi: Float[Array, " N"],
     encoded: Float[Array, "N E"],
-    samples: sampling.Samples,
-    pixels: Pixels,
+    batch: Batch,
+    totals: Totals,
     cfg: Config,
 ) -> Float[Array, ""]:
     """Colour rendered on some samples of each ray, spread over the truncation region (Eqs. 4 and 12)."""
-    rays, count = samples.depth.shape
+    rays, count = batch.samples.depth.shape
     some = _color_samples(count, cfg)
     psi = jax.lax.stop_gradient(psi).reshape(rays, count)[:, some]
-    weights = losses.render_weights(psi, samples.near[:, some], cfg.field.truncation)
+    weights = losses.render_weights(psi, batch.samples.near[:, some], cfg.field.truncation)
     picked = encoded.reshape(rays, count, -1)[:, some]
     rgb = nf.decode_color(field, picked.reshape(-1, picked.shape[-1])).reshape(*weights.shape, 3)
-    return losses.rgb(losses.render(weights, rgb), pixels.color, pixels.depth > 0)
+    measured = batch.pixels.depth > 0
+    mean = losses.rgb(losses.render(weights, rgb), batch.pixels.color, measured)
+    return mean * (_count(measured) / totals.measured)
+
+
+def _count(mask: Bool[Array, "*S"]) -> Float[Array, ""]:
+    """Of true values, at least 1."""
+    return jnp.maximum(jnp.sum(mask.astype(jnp.float32)), 1)
 
 
 def _color_samples(count: int, cfg: Config) -> np.ndarray:
