@@ -135,7 +135,7 @@ def perturb(poses: Float[Array, "F 4 4"], twist: Float[Array, "F 6"]) -> Float[A
 
 def map_loss(
     field: nf.Field, frames: Frames, key: PRNGKeyArray, camera: Intrinsics, cfg: Config
-) -> tuple[Float[Array, ""], tuple[nf.Field, Float[Array, "F 6"]]]:
+) -> tuple[Float[Array, ""], tuple[optax.Updates, Float[Array, "F 6"]]]:
     """The mapping loss on one draw of pixels and samples of every frame (Eq. 18), and its gradient.
 
     The gradient is that for the networks and for a twist (v, omega) of each frame, and is summed over chunks of
