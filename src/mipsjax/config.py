@@ -175,6 +175,9 @@ class SearchConfig:
     """Nats; bounds the weight 1 / h^2 of a certain point."""
     residual: float = 0.012
     """Metres; gradient-based optimisation that ends above it has not converged."""
+    residual_margin: float = 1.3
+    """Above this many times the least residual of late it has not converged either, where that is more: no frame fits
+    better than the sensor's noise. At most twice `residual`."""
     inliers: float = 0.7
     """Share of pixels within 5 cm; gradient-based optimisation that ends below it has not converged."""
 
@@ -291,6 +294,9 @@ class LoopConfig:
     """Least share of a frame's pixels that the other submap must know for a link to it."""
     inliers: float = 0.8
     """Least share of these that must be within `keyframe.error` of its surface."""
+    held: float = 3e-4
+    """How firmly the surfaces must hold the frame in every direction (`core/tracking.py: Registration.held`); furnished
+    rooms have 4e-3 to 15e-3, a bare corridor 4e-6."""
     drift: float = 0.05
     """Metres of drift for each metre from the anchor that a submap begun from another may hide: ten times what is
     usual, since a true loop that comes after more drift than this would allow is rejected."""

@@ -90,6 +90,12 @@ def widening(trouble: int, cfg: Config) -> float:
     return limit if trouble * log(factor) >= log(limit) else factor**trouble
 
 
+def converged(residual: float, cfg: Config) -> float:
+    """Metres; the residual above which RO is needed, where the least of trusted frames is `residual`."""
+    ro = cfg.track.ro
+    return min(max(ro.residual, ro.residual_margin * residual), 2 * ro.residual)
+
+
 def _status(stats: FrameStats, cfg: Config) -> Status:
     if not stats.finite or stats.known < cfg.guard.lost:
         return Status.LOST

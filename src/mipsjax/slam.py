@@ -22,24 +22,26 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.policy import Decision, FrameStats, Status, decide, widening
+from mipsjax.policy import Decision, FrameStats, Status, converged, decide, widening
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.state import (
     FrameInfo,
     Keyframe,
+    Motion,
     Pose,
     Record,
     SlamState,
     distance,
+    inverse,
     last_pose,
     rigid,
     thumbnail,
-    world_pose,
 )
 from mipsjax.territory import begin, govern, settle
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
+RESIDUAL_RISE = 0.02  # share of a frame's excess by which the least residual of late goes up
 
 
 def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | None = None) -> SlamState:
@@ -69,7 +71,8 @@ def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         return _recover(state, frame, f"known {stats.known:.2f}", info, track_ms, cfg)
-    state = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
+    learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
+    state = _moved_on(learned, state, float(info.after.residual))
     if state.records[-1].info.keyframe:
         state = _order(state, cfg)
     return refine_inactive(state, cfg)
@@ -107,7 +110,7 @@ def _recover(
     )
     record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
     record = record._replace(depth=thumbnail(frame.depth, state.camera))
-    return place.state._replace(records=(*state.records, record), trouble=1)
+    return place.state._replace(records=(*state.records, record), trouble=1, motion=None)
 
 
 def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.TrackInfo]:
@@ -123,6 +126,7 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
         state.camera,
         cfg,
         _views(state, cfg),
+        np.float32(converged(state.residual, cfg)),
     )
     T, info = jax.device_get((T, info))
     return rigid(T), info
@@ -209,15 +213,25 @@ def _coast(
 
 
 def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
-    """Constant velocity over the real time between frames, and no motion."""
+    """Constant velocity over the real time since the last trusted frame, and no motion."""
     last = last_pose(state)
-    trusted = [r for r in state.records[-8:] if r.status in (Status.OK, Status.WEAK)][-2:]
-    if len(trusted) < 2:
+    if state.motion is None:
         return [last, last]
-    older, newer = trusted
-    ratio = (timestamp - newer.timestamp) / max(newer.timestamp - older.timestamp, DT_MIN)
-    motion = np.linalg.inv(world_pose(state, older)) @ world_pose(state, newer)
-    return [last @ _scaled(motion, min(max(ratio, 0.0), DT_RATIO_MAX)), last]
+    ratio = (timestamp - _last_trusted(state).timestamp) / max(state.motion.seconds, DT_MIN)
+    return [last @ _scaled(state.motion.T_older_newer, min(max(ratio, 0.0), DT_RATIO_MAX)), last]
+
+
+def _last_trusted(state: SlamState) -> Record:
+    return next(r for r in reversed(state.records) if r.status in (Status.OK, Status.WEAK))
+
+
+def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState:
+    """With motion and residual after a trusted frame."""
+    newest, older = state.records[-1], _last_trusted(before)
+    motion = Motion(inverse(last_pose(before)) @ last_pose(state), newest.timestamp - older.timestamp)
+    over = max(residual - before.residual, 0.0)
+    floor = min(residual, before.residual + RESIDUAL_RISE * over) if before.residual else residual
+    return state._replace(motion=motion, residual=floor)
 
 
 def _scaled(motion: Pose, ratio: float) -> Pose:
@@ -264,6 +278,7 @@ def _info(info: tracking.TrackInfo, track_ms: float) -> FrameInfo:
         residual_before=float(info.before.residual),
         residual_after=float(info.after.residual),
         known=float(info.after.known),
+        confirmed=float(info.after.confirmed),
         searched=bool(info.searched),
         track_ms=track_ms,
     )

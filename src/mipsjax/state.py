@@ -68,6 +68,14 @@ class Record(NamedTuple):
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
 
 
+class Motion(NamedTuple):
+    """Between the last two trusted frames."""
+
+    T_older_newer: Pose
+    """Camera to camera."""
+    seconds: float
+
+
 class FrameInfo(NamedTuple):
     """For the reader of `status.csv`; nothing depends on it."""
 
@@ -76,6 +84,8 @@ class FrameInfo(NamedTuple):
     residual_after: float = float("nan")
     known: float = float("nan")
     """Share of measured pixels within 5 cm of the mapped surface, before mapping."""
+    confirmed: float = float("nan")
+    """The same where the map is certain."""
     searched: bool = False
     """RO was run."""
     keyframe: bool = False
@@ -122,6 +132,10 @@ class SlamState(NamedTuple):
     trouble: int
     """Weak or lost frames in a row, up to now."""
     loops: tuple[Loop, ...] = ()
+    motion: Motion | None = None
+    """None where one of the last two frames was not trusted."""
+    residual: float = 0.0
+    """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
 
     @property
     def submap(self) -> Submap:

@@ -76,7 +76,8 @@ def sight(state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Co
             cfg,
         )
     )
-    fits = found.overlap >= cfg.loop.overlap and found.inliers >= cfg.loop.inliers
+    loop = cfg.loop
+    fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers and found.held >= loop.held
     if not (np.isfinite(found.T_sub_cam).all() and fits):
         return None
     return Sighting(place, rigid(found.T_sub_cam), float(found.inliers))

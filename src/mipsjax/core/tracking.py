@@ -44,6 +44,8 @@ class Fit(NamedTuple):
     """Root of the mean robust cost, metres."""
     known: Float[Array, ""]
     """Share of measured pixels within `keyframe.error` of the mapped surface."""
+    confirmed: Float[Array, ""]
+    """The same where the map is also certain: space that was never observed looks like surface, but not certainly."""
 
 
 class TrackInfo(NamedTuple):
@@ -78,11 +80,15 @@ def robust_cost(psi: Float[Array, " P"], scale: float) -> Float[Array, " P"]:
 
 
 def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> Fit:
-    """Residual and share of known pixels at a pose."""
-    psi = nf.tsdf(field, transform(T, points.p_cam), cfg.field, part).psi
-    cost = losses.masked_mean(robust_cost(psi, cfg.track.go.robust), points.mask)
-    known = losses.masked_mean((jnp.abs(psi) < cfg.keyframe.error).astype(psi.dtype), points.mask)
-    return Fit(jnp.sqrt(cost), known)
+    """Residual and shares of known pixels at a pose."""
+    prediction = nf.tsdf(field, transform(T, points.p_cam), cfg.field, part)
+    cost = losses.masked_mean(robust_cost(prediction.psi, cfg.track.go.robust), points.mask)
+    near = jnp.abs(prediction.psi) < cfg.keyframe.error
+    certain = nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)
+    known, confirmed = (
+        losses.masked_mean(m.astype(jnp.float32), points.mask) for m in (near, near & certain)
+    )
+    return Fit(jnp.sqrt(cost), known, confirmed)
 
 
 class System(NamedTuple):
@@ -109,33 +115,17 @@ def levenberg_marquardt(
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement. Depth images of keyframes are a second term where `views` are given.
     """
-    go, scale = cfg.track.go, cfg.track.go.robust
-
-    def jacobian(T, gradient):
-        gradient = gradient @ T[:3, :3]
-        return jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
-
-    def distance(p_sub):
-        prediction = nf.tsdf(field, p_sub, cfg.field, part)
-        return prediction.psi, prediction.entropy
-
-    def from_map(T):
-        psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
-        rows = jacobian(T, pull(jnp.ones_like(psi))[0])
-        weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
-        if go.uncertainty:
-            weight *= losses.certainty(entropy, go.entropy_floor)
-        return _system(psi, rows, weight, robust_cost(psi, scale) * points.mask)
+    go = cfg.track.go
 
     def from_view(T, errors):
-        rows, narrow = jacobian(T, errors.normal), go.view_robust
+        rows, narrow = _jacobian(T, points, errors.normal), go.view_robust
         weight = go.view_weight * points.mask * errors.mask / (1 + (errors.distance / narrow) ** 2)
         # A point that falls on nothing costs as much as one that is as far off as is allowed
         off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
         return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * points.mask)
 
     def system(T):
-        total = from_map(T)
+        total = map_system(field, T, points, part, cfg)
         if views is None or view_camera is None:
             return total
         errors = plane_errors(views, transform(T, points.p_cam), view_camera, VIEW_REACH)
@@ -156,6 +146,28 @@ def levenberg_marquardt(
     start = ((T, system(T)), jnp.float32(DAMPING))
     ((T, _), _), _ = jax.lax.scan(step, start, None, length=steps)
     return T
+
+
+def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> System:
+    """Normal equations of the points' distances at a pose, for a twist (v, omega) in the camera's frame."""
+
+    def distance(p_sub):
+        prediction = nf.tsdf(field, p_sub, cfg.field, part)
+        return prediction.psi, prediction.entropy
+
+    go, scale = cfg.track.go, cfg.track.go.robust
+    psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
+    rows = _jacobian(T, points, pull(jnp.ones_like(psi))[0])
+    weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
+    if go.uncertainty:
+        weight *= losses.certainty(entropy, go.entropy_floor)
+    return _system(psi, rows, weight, robust_cost(psi, scale) * points.mask)
+
+
+def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
+    """Of distances with this gradient in the submap's frame."""
+    gradient = gradient @ T[:3, :3]
+    return jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
 
 
 def _system(
@@ -219,6 +231,7 @@ def track(
     camera: Intrinsics,
     cfg: Config,
     views: Views | None = None,
+    converged: Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
 
@@ -226,8 +239,8 @@ def track(
     field also align the frame to.
 
     With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best
-    candidate, and RO then GO follow where that did not converge; the better end is kept. `widening` is a factor
-    on the swarm's first radii.
+    candidate, and RO then GO follow where that ends above the residual `converged` (metres, `track.ro.residual` if
+    not given); the better end is kept. `widening` is a factor on the swarm's first radii.
     """
     k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
     ro, go = cfg.track.ro, cfg.track.go
@@ -254,7 +267,8 @@ def track(
         (T, after), used_ro = searched(start), jnp.bool_(True)
     else:
         T, after = refined(start)
-        used_ro = (after.residual > ro.residual) | (after.known < ro.inliers) | ~jnp.isfinite(after.residual)
+        limit = ro.residual if converged is None else converged
+        used_ro = (after.residual > limit) | (after.known < ro.inliers) | ~jnp.isfinite(after.residual)
         used_ro = used_ro & (ro.when == "needed")
 
         def again():
@@ -300,6 +314,10 @@ class Registration(NamedTuple):
     """Share of measured pixels where the submap is certain of its distance."""
     inliers: Float[Array, ""]
     """Share of those that are within `keyframe.error` of its surface."""
+    held: Float[Array, ""]
+    """How firmly the surface holds the pose in the direction where it holds it least: mean square of metres of
+    distance for a metre, or a radian, of motion. Near 0 the frame slides or turns freely, as in a bare corridor, and
+    the guess says where it is."""
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
@@ -313,13 +331,16 @@ def register(
     """Second-order steps from a guess `T`, and what speaks for where they end. `depth` is at mapping size."""
     color = jnp.zeros((*depth.shape, 3), jnp.uint8)
     points = draw_points(jax.random.key(0), depth, color, cfg.track.go.pixels, camera)
-    T = levenberg_marquardt(field, T, points, "search", cfg.track.go.smooth_steps, cfg)
+    if cfg.field.encoding == "both":
+        T = levenberg_marquardt(field, T, points, "search", cfg.track.go.smooth_steps, cfg)
     T = levenberg_marquardt(field, T, points, "whole", cfg.track.go.steps, cfg)
+    hessian = map_system(field, T, points, "whole", cfg).hessian
+    held = jnp.linalg.eigvalsh(hessian)[0] / jnp.maximum(jnp.sum(points.mask), 1)
     prediction = nf.tsdf(field, transform(T, points.p_cam), cfg.field)
     certain = points.mask & nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)
     near = (jnp.abs(prediction.psi) < cfg.keyframe.error).astype(jnp.float32)
     overlap = losses.masked_mean(certain.astype(jnp.float32), points.mask)
-    return Registration(T, overlap, losses.masked_mean(near, certain))
+    return Registration(T, overlap, losses.masked_mean(near, certain), held)
 
 
 def search(
