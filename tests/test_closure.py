@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from maps import keyframe, pose, state, submap
-from mipsjax.closure import solve
+from mipsjax.closure import reconciled, solve
 from mipsjax.core import mapping
 from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, distance
@@ -69,6 +69,17 @@ def test_a_false_loop_is_rejected_and_the_true_one_kept(ring):
     solved, weights = solve(wrong, CFG)
     assert weights[0, COUNT - 1] == 1 and weights[1, 4] == 0
     assert off(solved, truth) < 0.1 * off(given, truth)
+
+
+def test_shared_frames_of_a_rejected_pair_are_dropped_where_they_were_not_tracked(ring):
+    given, _ = ring
+    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    tracked = [given.records[0]._replace(submap=4 if number == 200 else COUNT - 1) for number in range(201)]
+    solved, weights = solve(wrong._replace(records=tuple(tracked)), CFG)
+    kept = [[k.number for k in submap.keyframes] for submap in reconciled(solved, weights, CFG).submaps]
+    before = [[k.number for k in submap.keyframes] for submap in given.submaps]
+    before[4].append(200)
+    assert kept == before
 
 
 def test_neighbours_along_the_chain_are_never_rejected(ring):

@@ -8,6 +8,7 @@ import pytest
 from maps import keyframe, pose, state, submap
 from mipsjax import links
 from mipsjax.config import Config
+from mipsjax.state import world_pose
 
 INF = float("inf")
 
@@ -65,6 +66,27 @@ def test_disagreement_is_between_world_poses():
     moved = pose(translation=(0.03, 0.0, 0.0))
     given = state(submap(keyframe(5, T_cam)), submap(keyframe(5), T_world_sub=moved @ T_cam))
     (link,) = links.links(*given.submaps)
-    assert links.disagreement(given, 0, 1, link) == pytest.approx(0.03)
+    assert links.misfit(given, 0, 1, link) == pytest.approx((0.03, 0), abs=1e-7)
     turned = given.with_submap(1, T_world_sub=T_cam @ pose((0.0, 0.0, 2.0)))
-    assert links.disagreement(turned, 0, 1, link) == pytest.approx(np.radians(2.0), rel=1e-4)
+    assert links.misfit(turned, 0, 1, link) == pytest.approx((0, np.radians(2.0)), rel=1e-4)
+
+
+def test_a_frame_is_unlinked_and_the_others_hang_where_they_hung():
+    given = state(
+        submap(keyframe(0), keyframe(5), keyframe(9, pose(translation=(1.0, 0.0, 0.0)))), submap(keyframe(5))
+    )
+    hung = given.records[0]._replace(keyframe=2)
+    given = given._replace(records=(hung, hung._replace(keyframe=0), hung._replace(submap=1, keyframe=0)))
+    without = links.unlinked(given, 0, 5)
+    assert [k.number for k in without.submaps[0].keyframes] == [0, 9]
+    assert [world_pose(without, r).tolist() for r in without.records] == [
+        world_pose(given, r).tolist() for r in given.records
+    ]
+
+
+def test_anchors_and_keyframes_that_frames_hang_on_stay():
+    given = state(submap(keyframe(0), keyframe(5)))
+    assert links.unlinked(given, 0, 0) is given
+    assert links.unlinked(given, 0, 7) is given
+    hung = given._replace(records=(given.records[0]._replace(keyframe=1),))
+    assert links.unlinked(hung, 0, 5) is hung

@@ -9,10 +9,12 @@ from mipsjax.config import Config
 from mipsjax.host.factors import Factor
 from mipsjax.host.features import Features, similar
 from mipsjax.host.registration import relative_pose
-from mipsjax.links import Link, chain_distances, disagreement, linked_pairs
+from mipsjax.links import Link, chain_distances, linked_pairs, links, misfit, sigmas, unlinked
 from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
+
+DOUBT = 3.0  # standard deviations of the drift beyond which a shared frame is taken for a false one
 
 
 def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Config) -> Sighting | None:
@@ -59,7 +61,7 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
         return state
     solved, weights = solve(state, cfg)
     moved = distance(_world(state), _world(solved))
-    made = tuple(
+    made = [
         Loop(
             frame=keyframe.number,
             first=active,
@@ -68,14 +70,15 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
             inliers=sighting.inliers,
             correction_m=moved[0],
             correction_rad=moved[1],
-            weight=weights[_pair(active, sighting.submap)],
+            weight=0.0,
         )
         for sighting, how in loops
-    )
-    for loop in made:
-        if not loop.weight:
-            solved = _unlinked(solved, loop.second, keyframe.number)
-    return solved._replace(loops=(*state.loops, *made))
+    ]
+    judged = [
+        loop._replace(weight=weights.get(_pair(loop.first, loop.second), 0.0))
+        for loop in (*state.loops, *made)
+    ]
+    return reconciled(solved, weights, cfg)._replace(loops=tuple(judged))
 
 
 def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int], float]]:
@@ -103,16 +106,28 @@ def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int
     return state, dict(zip(places, judged.weights.tolist(), strict=True))
 
 
+def reconciled(state: SlamState, weights: dict[tuple[int, int], float], cfg: Config) -> SlamState:
+    """Without the shared frames that the pose graph has shown to be wrong.
+
+    These are all of a rejected pair, and those of others that disagree by more than the drift within their submaps
+    can explain. The frame stays where it was tracked. What made a submap begin stays in any case.
+    """
+    for (j, k), weight in weights.items():
+        if state.submaps[k].parent == j or state.submaps[j].parent == k:
+            continue
+        for shared in links(state.submaps[j], state.submaps[k]):
+            turn, shift = sigmas(shared, cfg)
+            off = np.divide(misfit(state, j, k, shared), (shift, turn))
+            if not weight or np.any(off > DOUBT):
+                owner = state.records[shared.first.number].submap
+                state = unlinked(state, k if owner == j else j, shared.first.number)
+    return state
+
+
 def _agrees(state: SlamState, place: int, cfg: Config) -> bool:
     """The newest frame has the same world pose by both of its submaps, within the tolerance."""
     newest = Link(state.submap.keyframes[-1], state.submaps[place].keyframes[-1])
-    return disagreement(state, state.active, place, newest) < cfg.loop.tolerance
-
-
-def _unlinked(state: SlamState, place: int, number: int) -> SlamState:
-    """Without a frame as a keyframe of a submap it turned out not to show."""
-    kept = tuple(k for k in state.submaps[place].keyframes if k.number != number)
-    return state.with_submap(place, keyframes=kept)
+    return max(misfit(state, state.active, place, newest)) < cfg.loop.tolerance
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:

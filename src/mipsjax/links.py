@@ -74,10 +74,27 @@ def sigmas(link: Link, cfg: Config) -> tuple[float, float]:
     return float(np.hypot(loop.sigma_rotation, turn)), float(np.hypot(loop.sigma, shift))
 
 
-def disagreement(state: SlamState, first: int, second: int, link: Link) -> float:
-    """Metres (or as many times 1 rad) between a frame's world poses by its two submaps."""
+def misfit(state: SlamState, first: int, second: int, link: Link) -> tuple[float, float]:
+    """Metres and radians between a frame's world poses by its two submaps."""
     one, other = (
         state.submaps[place].T_world_sub @ keyframe.T_sub_cam
         for place, keyframe in zip((first, second), link, strict=True)
     )
-    return max(distance(one, other))
+    return distance(one, other)
+
+
+def unlinked(state: SlamState, place: int, number: int) -> SlamState:
+    """Without a frame as a keyframe of a submap; frames that hang on later keyframes go on hanging on them.
+
+    An anchor stays, and so does a keyframe on which frames hang.
+    """
+    keyframes = state.submaps[place].keyframes
+    gone = next((i for i, keyframe in enumerate(keyframes) if keyframe.number == number), 0)
+    if not gone or any(r.submap == place and r.keyframe == gone for r in state.records):
+        return state
+    records = tuple(
+        r._replace(keyframe=r.keyframe - 1) if r.submap == place and r.keyframe > gone else r
+        for r in state.records
+    )
+    state = state._replace(records=records)
+    return state.with_submap(place, keyframes=(*keyframes[:gone], *keyframes[gone + 1 :]))
