@@ -50,16 +50,46 @@ def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
 
 
 def refine(
-    submap: Submap, chosen: list[int], share: float, steps: int, number: int, camera: Intrinsics, cfg: Config
+    submap: Submap,
+    chosen: list[int],
+    share: float,
+    steps: int,
+    key: jax.Array,
+    camera: Intrinsics,
+    cfg: Config,
 ) -> tuple[Submap, bool]:
     """`adjust` on some keyframes of a submap itself, all but the anchor at a share of the pose rate."""
-    batch = [submap.keyframes[i] for i in chosen]
-    rates = [share if i != 0 else 0.0 for i in chosen]
-    learned, poses, ok = adjust(submap.learned, batch, rates, steps, number, camera, cfg)
-    keyframes = list(submap.keyframes)
-    for i, pose in zip(chosen, poses, strict=True):
-        keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
-    return submap._replace(learned=learned, keyframes=tuple(keyframes)), ok
+    batch, rates = _batch(submap, chosen, share)
+    learned, poses, ok = adjust(submap.learned, batch, rates, steps, key, camera, cfg)
+    return _taken_over(submap, chosen, learned, poses), ok
+
+
+def refine_together(
+    submaps: list[Submap],
+    chosen: list[list[int]],
+    share: float,
+    steps: int,
+    keys: list[jax.Array],
+    camera: Intrinsics,
+    cfg: Config,
+) -> list[Submap]:
+    """`refine` of several submaps in one call, spread over the devices."""
+    parts = [_batch(submap, places, share) for submap, places in zip(submaps, chosen, strict=True)]
+    frames = [_frames(batch, rates) for batch, rates in parts]
+    stack = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *zip([s.learned for s in submaps], frames, keys, strict=True)
+    )
+    learned, views, keys_ = stack
+    at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
+    learned, poses, _ = mapping.refine_stack(
+        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, at_once
+    )
+    learned = jax.device_get(learned)  # and back to the first device, whatever refined it
+    refined = []
+    for place, (submap, (batch, rates)) in enumerate(zip(submaps, parts, strict=True)):
+        one = jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), learned)  # noqa: B023 (called here)
+        refined.append(_taken_over(submap, chosen[place], one, _poses(poses[place], batch, rates)))
+    return refined
 
 
 def adjust(
@@ -67,7 +97,7 @@ def adjust(
     batch: list[Keyframe],
     rates: list[float],
     steps: int,
-    number: int,
+    key: jax.Array,
     camera: Intrinsics,
     cfg: Config,
     rate: float = 1.0,
@@ -76,18 +106,41 @@ def adjust(
 
     Returns what was learned, the poses and whether all stayed finite; if not, nothing has changed.
     """
-    frames = mapping.Frames(
+    learned, poses, info = mapping.refine(
+        learned,
+        _frames(batch, rates),
+        jnp.int32(steps),
+        key,
+        mapping_camera(camera, cfg),
+        cfg,
+        np.float32(rate),
+    )
+    return learned, _poses(poses, batch, rates), bool(info.ok)
+
+
+def _batch(submap: Submap, chosen: list[int], share: float) -> tuple[list[Keyframe], list[float]]:
+    return [submap.keyframes[i] for i in chosen], [share if i != 0 else 0.0 for i in chosen]
+
+
+def _frames(batch: list[Keyframe], rates: list[float]) -> mapping.Frames:
+    return mapping.Frames(
         depth=jnp.asarray(np.stack([k.depth for k in batch])),
         color=jnp.asarray(np.stack([k.color for k in batch])),
         T_sub_cam=jnp.asarray(np.stack([k.T_sub_cam for k in batch]), jnp.float32),
         movable=jnp.asarray(np.array(rates, np.float32)),
     )
-    small = mapping_camera(camera, cfg)
-    learned, poses, info = mapping.refine(
-        learned, frames, jnp.int32(steps), random_key(cfg, MAP, number), small, cfg, np.float32(rate)
-    )
-    moved = [
+
+
+def _poses(poses: jax.Array, batch: list[Keyframe], rates: list[float]) -> list[Pose]:
+    """In double precision; those at rate 0 as they were, to the bit."""
+    return [
         rigid(pose) if rate else k.T_sub_cam
         for pose, rate, k in zip(np.asarray(poses), rates, batch, strict=True)
     ]
-    return learned, moved, bool(info.ok)
+
+
+def _taken_over(submap: Submap, chosen: list[int], learned: mapping.Learned, poses: list[Pose]) -> Submap:
+    keyframes = list(submap.keyframes)
+    for i, pose in zip(chosen, poses, strict=True):
+        keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
+    return submap._replace(learned=learned, keyframes=tuple(keyframes))

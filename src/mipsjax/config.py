@@ -269,6 +269,10 @@ class BackgroundConfig:
     """Frames between two refinements; 0 is none. The paper's second process refines all the time."""
     steps: int = 10
     """Of local bundle adjustment on the anchor and random keyframes of the submap."""
+    together: int = 1
+    """Submaps refined at once, as soon as so many are inactive; they are spread over devices."""
+    executor: Literal["inline", "thread"] = "inline"
+    """Where: between frames, or beside them. The results are the same to the bit."""
     pose_rate: float = 0.0
     """Share of the pose learning rate (see `map.pose_rate_slow`); 1 is the paper."""
 

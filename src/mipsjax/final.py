@@ -5,18 +5,21 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import FINISH, adjust
+from mipsjax.background import taken_over
+from mipsjax.bundle import FINISH, MAP, adjust, random_key
 from mipsjax.config import Config
 from mipsjax.core import tracking
+from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import THUMBNAIL_UNIT, Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride
 
 BATCH_STEPS = 10  # of mapping on each random batch of keyframes
 ALIGNED = 16  # frames in one call of `tracking.align`
 
 
-def finish(state: SlamState, cfg: Config) -> SlamState:
+def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
     """The state after the last frame: `map.final_steps` steps of mapping of each submap, then `track.go.final_steps`
-    of tracking of each frame."""
+    of tracking of each frame. `executor` is the one that `step` was given."""
+    state = taken_over(state, executor)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":
@@ -35,8 +38,9 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
         chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
         fall = 1 - call / calls
         rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
-        batch, number = [keyframes[i] for i in chosen], len(state.records) + call
-        learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, number, state.camera, cfg, fall)
+        batch = [keyframes[i] for i in chosen]
+        key = random_key(cfg, MAP, len(state.records) + call)
+        learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, key, state.camera, cfg, fall)
         for i, pose in zip(chosen, poses, strict=True):
             keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
     return state.with_submap(place, learned=learned, keyframes=tuple(keyframes))

@@ -134,6 +134,7 @@ RANGES: dict[str, Range] = {
     "volume.margin": NOT_NEGATIVE,
     "background.every_frames": NOT_NEGATIVE,
     "background.steps": NOT_NEGATIVE,
+    "background.together": POSITIVE,
     "background.pose_rate": SHARE,
     "loop.patience": COUNT,
     "loop.apart": COUNT,

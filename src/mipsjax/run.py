@@ -33,6 +33,7 @@ from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
 from mipsjax.final import finish
 from mipsjax.policy import Status
 from mipsjax.reconstruct import reconstruct
+from mipsjax.schedule import executor
 from mipsjax.state import FrameInfo, Pose, SlamState
 from mipsjax.summary import FrameRow, Run, verdict
 
@@ -72,25 +73,26 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
     read_s: list[float] = []
     step_s: list[float] = []
     bad, core = 0, _of_the_method(cfg)
-    for position in range(len(sequence)):
-        if stop() or bad > cfg.input.max_bad_frames:
-            break
+    with executor(cfg.background.executor) as beside:
+        for position in range(len(sequence)):
+            if stop() or bad > cfg.input.max_bad_frames:
+                break
+            began = perf_counter()
+            frame = sequence[position]
+            read_s.append(perf_counter() - began)
+            if state is not None:
+                state = slam.step(state, frame, core, beside)
+            elif reason := anchor_problem(frame):
+                waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
+            else:
+                state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
+            step_s.append(perf_counter() - began - read_s[-1])
+            status = Status.SKIPPED if state is None else state.records[-1].status
+            bad += status is Status.SKIPPED
+            tell(status)
         began = perf_counter()
-        frame = sequence[position]
-        read_s.append(perf_counter() - began)
         if state is not None:
-            state = slam.step(state, frame, core)
-        elif reason := anchor_problem(frame):
-            waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
-        else:
-            state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
-        step_s.append(perf_counter() - began - read_s[-1])
-        status = Status.SKIPPED if state is None else state.records[-1].status
-        bad += status is Status.SKIPPED
-        tell(status)
-    began = perf_counter()
-    if state is not None:
-        state = finish(state, core)
+            state = finish(state, core, beside)
     finish_s = perf_counter() - began
     too_bad = bad > cfg.input.max_bad_frames
     end = "bad frames" if too_bad else "interrupted" if len(read_s) < len(sequence) else "done"

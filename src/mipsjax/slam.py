@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mipsjax.background import refine_inactive
-from mipsjax.bundle import CHOOSE, TRACK, choose, make_keyframe, random_key, refine
+from mipsjax.background import refine_inactive, taken_over
+from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine
 from mipsjax.closure import close
 from mipsjax.config import Config
 from mipsjax.core import tracking
@@ -22,8 +22,9 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.policy import Decision, FrameStats, Status, converged, decide, widening
+from mipsjax.policy import STAY, Decision, FrameStats, Status, converged, decide, widening
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
+from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import (
     FrameInfo,
     Keyframe,
@@ -37,7 +38,7 @@ from mipsjax.state import (
     rigid,
     thumbnail,
 )
-from mipsjax.territory import begin, govern, settle
+from mipsjax.territory import begin, enter, govern, settle
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
@@ -60,8 +61,11 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     return SlamState((submap,), 0, (record,), camera, 0)
 
 
-def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
-    """Tracks one frame, decides what it is worth, learns from it, and keeps the submaps in order."""
+def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLINE) -> SlamState:
+    """Tracks one frame, decides what it is worth, learns from it, and keeps the submaps in order.
+
+    `executor` refines inactive submaps meanwhile; what comes out is the same to the bit with any (`schedule.py`).
+    """
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
     began = perf_counter()
@@ -70,21 +74,23 @@ def step(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
     stats = _stats(state, T_sub_cam, info)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
-        return _recover(state, frame, f"known {stats.known:.2f}", info, track_ms, cfg)
+        return _recover(taken_over(state, executor), frame, f"known {stats.known:.2f}", info, track_ms, cfg)
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
     state = _moved_on(learned, state, float(info.after.residual))
     if state.records[-1].info.keyframe:
-        state = _order(state, cfg)
-    return refine_inactive(state, cfg)
+        state = _order(state, cfg, executor)
+    return refine_inactive(state, cfg, executor)
 
 
-def _order(state: SlamState, cfg: Config) -> SlamState:
+def _order(state: SlamState, cfg: Config, executor: Executor) -> SlamState:
     """After a new keyframe: the other submaps see it, loops are closed, and the right submap takes over."""
     began, before = perf_counter(), state
     state, sightings = settle(state, cfg)
     if cfg.loop.enabled:
         state = close(state, sightings, before, cfg)
-    state = govern(state, cfg)
+    choice = govern(state, cfg)
+    if choice != STAY:
+        state = enter(taken_over(state, executor), choice, cfg)
     last = state.records[-1]
     info = last.info._replace(submap=state.active, order_ms=_ms(began))
     return state._replace(records=(*state.records[:-1], last._replace(info=info)))
@@ -169,7 +175,8 @@ def _learn(
         batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
         steps, share = decision.map_steps, decision.pose_rate
         newest = len(batch.keyframes) - 1
-        batch, ok = refine(batch, [newest, *chosen], share, steps, number, state.camera, cfg)
+        key = random_key(cfg, MAP, number)
+        batch, ok = refine(batch, [newest, *chosen], share, steps, key, state.camera, cfg)
         T_sub_cam = batch.keyframes[-1].T_sub_cam
         kept = batch if made else batch._replace(keyframes=batch.keyframes[:-1])
         state = state.with_submap(state.active, **kept._asdict())

@@ -13,6 +13,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.volume import Box
 from mipsjax.host.features import Features
 from mipsjax.policy import Status
+from mipsjax.schedule import Job
 
 Pose = Float64[np.ndarray, "4 4"]
 How = Literal["box", "features"]
@@ -66,6 +67,14 @@ class Record(NamedTuple):
     info: FrameInfo
     depth: UInt16[np.ndarray, "h w"] | None = None
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
+
+
+class Refinement(NamedTuple):
+    """Of some inactive submaps, begun after one frame and taken over after a later one."""
+
+    places: tuple[int, ...]
+    job: Job
+    """Gives the submaps as they become from what they were when it began."""
 
 
 class Motion(NamedTuple):
@@ -134,6 +143,8 @@ class SlamState(NamedTuple):
     loops: tuple[Loop, ...] = ()
     motion: Motion | None = None
     """None where one of the last two frames was not trusted."""
+    refinement: Refinement | None = None
+    """Under way."""
     residual: float = 0.0
     """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
 

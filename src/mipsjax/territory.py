@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, adjust, choose, mapping_camera, random_key, refine
+from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
@@ -34,7 +34,8 @@ def begin(
     keyframes = (anchor._replace(T_sub_cam=np.eye(4)), *support)
     learned = mapping.create(random_key(cfg, INIT, anchor.number), cfg)
     batch = [keyframes[i % len(keyframes)] for i in range(cfg.map.frames)]
-    learned, _, ok = adjust(learned, batch, [0.0] * len(batch), steps, anchor.number, camera, cfg)
+    key = random_key(cfg, MAP, anchor.number)
+    learned, _, ok = adjust(learned, batch, [0.0] * len(batch), steps, key, camera, cfg)
     box = volume.grow(None, *_seen(keyframes[0], camera, cfg), cfg.volume)
     return Submap(learned, box, keyframes, T_world_sub), ok
 
@@ -89,8 +90,8 @@ def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:
     return state.with_submap(found.submap, keyframes=(*known, keyframe._replace(T_sub_cam=found.T_sub_cam)))
 
 
-def govern(state: SlamState, cfg: Config) -> SlamState:
-    """The submap that the camera is tracked in from here on: the same, an old one, or a new one."""
+def govern(state: SlamState, cfg: Config) -> int:
+    """Which submap the camera is tracked in from here on: STAY, NEW, or the place of an old one."""
     keyframe = state.submap.keyframes[-1]
     p_cam, mask = volume.seen(keyframe.depth, mapping_camera(state.camera, cfg), cfg.volume)
     shares = {}
@@ -99,7 +100,11 @@ def govern(state: SlamState, cfg: Config) -> SlamState:
         if last.number == keyframe.number:
             shares[place] = volume.contained(submap.box, volume.moved(last.T_sub_cam, p_cam), mask)
     fresh = volume.contained(volume.grow(None, p_cam, mask, cfg.volume), p_cam, mask)
-    choice = governor(shares.pop(state.active), shares, fresh, cfg)
+    return governor(shares.pop(state.active), shares, fresh, cfg)
+
+
+def enter(state: SlamState, choice: int, cfg: Config) -> SlamState:
+    """With the submap active that `govern` chose."""
     if choice == STAY:
         return state
     return _begin_here(state, cfg) if choice == NEW else _revisit(state, choice, cfg)
@@ -124,8 +129,8 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
     if cfg.map.revisit_steps:
         known = submap._replace(keyframes=submap.keyframes[:-1])
         others = choose(known, cfg.map.frames - 2, (cfg.seed, INIT, number))
-        share = cfg.map.pose_rate_slow
-        submap, _ = refine(submap, [newest, *others], share, cfg.map.revisit_steps, number, state.camera, cfg)
+        share, key = cfg.map.pose_rate_slow, random_key(cfg, MAP, number)
+        submap, _ = refine(submap, [newest, *others], share, cfg.map.revisit_steps, key, state.camera, cfg)
     box = volume.grow(submap.box, *_seen(submap.keyframes[-1], state.camera, cfg), cfg.volume)
     return moved_in(state.with_submap(place, **submap._replace(box=box)._asdict()), place, newest)
 

@@ -124,6 +124,35 @@ def refine(
     return learned, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
 
 
+@partial(jax.jit, static_argnames=("camera", "cfg", "vmap"))
+def refine_stack(
+    learned: Learned,
+    frames: Frames,
+    steps: Int[Array, ""],
+    keys: PRNGKeyArray,
+    camera: Intrinsics,
+    cfg: Config,
+    vmap: bool = False,
+) -> tuple[Learned, Float[Array, "S F 4 4"], MapInfo]:
+    """`refine` of S submaps in one call: learned, frames and keys have a leading axis of them.
+
+    That axis is spread over the devices, if S is a multiple of their number; each refines its part one after the
+    other, to the same bits as `refine`, or with `vmap` all at once, rounded otherwise.
+    """
+
+    def one(part):
+        mine, views, key = part
+        return refine(mine, views, steps, key, camera, cfg)
+
+    several = jax.vmap(one) if vmap else partial(jax.lax.map, one)
+    devices = jax.devices()
+    if len(devices) > 1 and len(keys) % len(devices) == 0:
+        mesh = jax.sharding.Mesh(np.array(devices), ("submap",))
+        shares = jax.sharding.PartitionSpec("submap")
+        several = jax.shard_map(several, mesh=mesh, in_specs=shares, out_specs=shares, check_vma=False)
+    return several((learned, frames, keys))
+
+
 def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
     """Poses after a twist (v, omega) in each camera's own frame; those with movable 0 stay."""
     return perturb(frames.T_sub_cam, twist * frames.movable[:, None])

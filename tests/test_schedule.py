@@ -1,0 +1,58 @@
+"""Jobs inline and in a thread."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from mipsjax.schedule import INLINE, Job, executor
+
+
+def test_inline_does_a_job_when_it_is_asked_for():
+    done = []
+    job = Job(lambda x: done.append(x) or 2 * x, (3,))
+    INLINE.start(job)
+    assert not done
+    assert INLINE.result(job) == 6 and done == [3]
+
+
+def test_a_thread_does_jobs_beside_the_caller_and_in_order():
+    with executor("thread") as beside:
+        jobs = [Job(lambda i: (i, threading.get_ident()), (i,)) for i in range(3)]
+        for job in jobs:
+            beside.start(job)
+        results = [beside.result(job) for job in reversed(jobs)]
+    assert [i for i, _ in results] == [2, 1, 0]
+    threads = {thread for _, thread in results}
+    assert len(threads) == 1 and threading.get_ident() not in threads
+
+
+def test_a_job_that_was_never_begun_is_done_when_asked_for():
+    """A state that was saved and loaded holds such jobs."""
+    with executor("thread") as beside:
+        assert beside.result(Job(max, (2, 5))) == 5
+
+
+def test_a_failed_job_raises_where_it_is_taken_over():
+    with executor("thread") as beside:
+        job = Job(int, ("no number",))
+        beside.start(job)
+        with pytest.raises(ValueError, match="no number"):
+            beside.result(job)
+
+
+def test_jobs_that_nobody_waits_for_do_not_outlive_the_executor():
+    release, begun, done = threading.Event(), threading.Event(), []
+
+    def slow() -> None:
+        begun.set()
+        release.wait()
+
+    with executor("thread") as beside:
+        beside.start(Job(slow, ()))
+        begun.wait()
+        beside.start(Job(done.append, (1,)))
+        release.set()
+    assert len(done) <= 1
+    assert not any(thread.name.startswith("mipsjax") for thread in threading.enumerate())
