@@ -6,7 +6,7 @@ import csv
 import resource
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,8 +34,15 @@ class Run(NamedTuple):
     row: dict[str, Any]
 
 
-def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -> Run:
-    """One whole sequence; the row holds the figures every table wants.
+def run(
+    path: str,
+    cfg: Config,
+    *,
+    frames: slice = slice(None),
+    seed: int = 0,
+    watch: Callable[[SlamState], None] = lambda state: None,
+) -> Run:
+    """One whole sequence; the row holds the figures every table wants. `watch` sees the state after each frame.
 
     `fps` counts the adjustment after the last frame, `fps_online` does not; `ate_online_cm` is the error before it.
     """
@@ -48,6 +55,7 @@ def run(path: str, cfg: Config, *, frames: slice = slice(None), seed: int = 0) -
         if position == WARM_UP:
             began = time.perf_counter()
         state = slam.step(state, sequence[position], cfg)
+        watch(state)
         if position == EARLY:
             early = peak_mb()
     loop_seconds, loop_peak = time.perf_counter() - began, peak_mb()

@@ -1,39 +1,106 @@
-"""Scenes of many submaps: accuracy with and without loop closure, loops found, memory of each submap.
+"""Scenes of many submaps: accuracy, loops, seams and memory, with parts of the method switched off.
 
     python experiments/large.py [--names corridor-loop+noise apartment+noise no-loop+noise living] [--seeds 0 1 2]
-                                [--stride 1] [--without-loop]
+                                [--switches full no-lc no-si no-sr] [--stride 1] [--no-surface]
 
-`living` is `small_house/living` of the development data. ATE RMSE after rigid alignment, over all frames. Writes
-`large.csv`, a row a run, and for each run a picture of the trajectory from above and the mesh.
+`living` is `small_house/living` of the development data. The switches are the paper's: no loop closure, no first fit of
+a new submap (SI), no bundle adjustment at a revisit (SR). ATE RMSE after rigid alignment, over all frames. The mesh is
+moved by that same alignment; accuracy and completeness by 1,000,000 points on each mesh, the reference culled to what
+the frames saw (every 10th). A seam is where two submaps meet: the distance across the surface from one to the other,
+as the median of each patch of 0.5 m. Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and
+for each run a picture of the trajectory from above and of the mesh.
 """
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+import trimesh
 
 from common import DATA, OUT, Run, changed, run, show, use_compilation_cache, write_rows
+from mipsjax.bundle import unprojected
 from mipsjax.config import Config
+from mipsjax.core import correspond, volume
+from mipsjax.data.open import open_sequence
+from mipsjax.data.synth.mesh import reference_mesh
 from mipsjax.host.metrics import align_rigid
 from mipsjax.host.picture import save_picture
+from mipsjax.host.surface import Views, compare_meshes
 from mipsjax.reconstruct import reconstruct
-from mipsjax.state import trajectory
+from mipsjax.state import Pose, SlamState, inverse, keyframe_bytes, trajectory
 
 NAMES = ("corridor-loop+noise", "apartment+noise", "no-loop+noise", "living")
+SWITCHES = {
+    "full": ("loop", {}),
+    "no-lc": ("loop", {"enabled": False}),
+    "no-si": ("map", {"submap_steps": 0}),
+    "no-sr": ("map", {"revisit_steps": 0}),
+}
+EVERY = 10  # frames whose depth decides what was seen; pixels between those in which seams are sought
+SAMPLES = 1_000_000  # on each mesh
+REFERENCE_VOXEL = 0.02
+PATCH = 0.5  # metres
+FEWEST = 8  # points of a patch
 
 
 def source(name: str) -> str:
     return str(DATA / "small_house" / "living") if name == "living" else f"synth:{name}"
 
 
-def plan(done: Run, path: str) -> None:
+def surface_row(done: Run, mesh: trimesh.Trimesh, name: str) -> dict[str, Any]:
+    """Of a mesh in the frame of the true poses."""
+    if name == "living":
+        exact, reference = done.sequence, trimesh.load(DATA / "small_house" / "mesh_gt.ply")
+        places = range(0, len(exact), EVERY)
+    else:
+        exact = open_sequence(source(name.split("+")[0]), frames=slice(0, None, EVERY))
+        reference, places = reference_mesh(exact.scene, REFERENCE_VOXEL), range(len(exact))
+    views = Views(exact.T_world_cam[list(places)], exact.intrinsics, (exact[i].depth for i in places))
+    error = compare_meshes(mesh, reference, views, count=SAMPLES).observed_part
+    assert error is not None
+    return {
+        "accuracy_cm": 100 * error.accuracy_m,
+        "completeness_cm": 100 * error.completeness_m,
+        "completion_5cm": error.completion_ratio,
+        "f_score_5cm": error.f_score,
+    }
+
+
+def seams(state: SlamState, cfg: Config) -> np.ndarray:
+    """Metres between the surfaces of two submaps, for every patch that both know."""
+    found = []
+    for j, first in enumerate(state.submaps):
+        measured = np.concatenate(
+            [unprojected(k, state.camera, cfg.volume.far, EVERY, cfg) for k in first.keyframes]
+        )
+        for k, second in enumerate(state.submaps):
+            T_k_j = inverse(second.T_world_sub) @ first.T_world_sub
+            both = volume.inside(first.box, measured) & volume.inside(
+                second.box, volume.moved(T_k_j, measured)
+            )
+            if j == k or both.sum() < FEWEST:
+                continue
+            start, mask = (jnp.asarray(a) for a in correspond.fixed_size(measured[both], cfg))
+            surface = correspond.surface_points(first.learned.field, start, mask, cfg)
+            T = jnp.asarray(T_k_j, jnp.float32)
+            matches = correspond.match(second.learned.field, T, surface, cfg)
+            off = np.asarray(correspond.residuals(surface, matches, T))[np.asarray(matches.mask)]
+            cells = np.floor(np.asarray(surface.points)[np.asarray(matches.mask)] / PATCH)
+            for cell in np.unique(cells, axis=0):
+                inside = off[(cells == cell).all(1)]
+                if len(inside) >= FEWEST:
+                    found.append(abs(np.median(inside)))
+    return np.array(found)
+
+
+def plan(done: Run, T: Pose, path: str) -> None:
     """The camera's way and the true one from above, metres; submaps by colour, anchors as dots."""
     poses, truth = trajectory(done.state)[:, :3, 3], done.sequence.T_world_cam
-    assert truth is not None
-    T = align_rigid(poses, truth[:, :3, 3])
-    at = poses @ T[:3, :3].T + T[:3, 3]
+    at = volume.moved(T, poses)
     place = np.array([record.submap for record in done.state.records])
     figure, axes = plt.subplots(figsize=(7, 7))
     axes.plot(truth[:, 0, 3], truth[:, 2, 3], color="black", linewidth=0.8, label="true")
@@ -47,31 +114,65 @@ def plan(done: Run, path: str) -> None:
     plt.close(figure)
 
 
+class Memory:
+    """Resident memory each time the number of submaps has grown."""
+
+    def __init__(self, about: dict[str, Any]) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._about = about
+
+    def __call__(self, state: SlamState) -> None:
+        if not self.rows or self.rows[-1]["submaps"] != len(state.submaps):
+            with open("/proc/self/statm") as file:
+                resident = int(file.read().split()[1]) * 4096 / 2**20
+            kept = {k.number: k for submap in state.submaps for k in submap.keyframes}
+            pixels = sum(keyframe_bytes(k) for k in kept.values())
+            self.rows.append(
+                self._about
+                | {"frame": len(state.records), "submaps": len(state.submaps), "resident_mb": resident}
+                | {"keyframes_mb": pixels / 2**20}
+            )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--names", nargs="*", default=list(NAMES))
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
+    parser.add_argument("--switches", nargs="*", default=["full"], choices=list(SWITCHES))
     parser.add_argument("--stride", type=int, default=1)
-    parser.add_argument("--without-loop", action="store_true", help="also without loop closure")
+    parser.add_argument("--no-surface", action="store_true", help="leaves accuracy and seams out")
+    parser.add_argument("--out", default="large", help="name of the CSV files")
     options = parser.parse_args()
     use_compilation_cache()
     OUT.mkdir(exist_ok=True)
-    rows = []
-    for name in options.names:
-        for seed in options.seeds:
-            for loop in (True, False) if options.without_loop else (True,):
-                cfg = changed(Config(), "loop", enabled=loop)
-                done = run(source(name), cfg, frames=slice(0, None, options.stride), seed=seed)
-                rows.append({"loop": loop} | done.row)
-                show(rows[-1])
-                for closed in done.state.loops:
-                    print("   ", closed, flush=True)
-                write_rows("large", rows)
-                title = f"{name}-{seed}-{'loop' if loop else 'open'}"
-                plan(done, f"plan-{title}")
-                save_picture(OUT / f"mesh-{title}.png", reconstruct(done.state, cfg))
+    rows, memory = [], []
+    for name, seed, switch in (
+        (n, s, w) for n in options.names for s in options.seeds for w in options.switches
+    ):
+        section, fields = SWITCHES[switch]
+        cfg, title = changed(Config(), section, **fields), f"{name}-{seed}-{switch}"
+        watch = Memory({"sequence": name, "seed": seed, "switch": switch})
+        done = run(source(name), cfg, frames=slice(0, None, options.stride), seed=seed, watch=watch)
+        memory += watch.rows
+        T = align_rigid(trajectory(done.state)[:, :3, 3], done.sequence.T_world_cam[:, :3, 3])
+        mesh = reconstruct(done.state, cfg).apply_transform(T)
+        row = {"switch": switch} | done.row
+        if not options.no_surface:
+            off = seams(done.state, cfg)
+            row |= surface_row(done, mesh, name)
+            if len(off):
+                row |= {"seam_median_cm": 100 * np.median(off), "seam_95_cm": 100 * np.quantile(off, 0.95)}
+                row |= {"seam_max_cm": 100 * off.max(), "seam_patches": len(off)}
+        rows.append(row)
+        show(row)
+        for closed in done.state.loops:
+            print("   ", closed, flush=True)
+        write_rows(options.out, rows)
+        write_rows(f"{options.out}-memory", memory)
+        plan(done, T, f"plan-{title}")
+        save_picture(OUT / f"mesh-{title}.png", mesh)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ CFG = Config(
 PLAIN = FrameStats(
     finite=True,
     known=0.9,
+    confirmed=0.8,
     since_keyframe=5,
     translation=0.05,
     rotation=0.02,
@@ -43,6 +44,12 @@ PLAIN = FrameStats(
 )
 def test_status(finite, known, status):
     assert decide(PLAIN._replace(finite=finite, known=known), CFG).status is status
+
+
+def test_a_frame_that_fits_only_where_nothing_was_observed_is_lost():
+    limit = CFG.guard.confirmed
+    assert decide(PLAIN._replace(confirmed=limit), CFG).status is Status.OK
+    assert decide(PLAIN._replace(confirmed=limit - 0.01), CFG).status is Status.LOST
 
 
 @pytest.mark.parametrize(

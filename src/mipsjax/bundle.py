@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float64
 
 from mipsjax.config import Config
-from mipsjax.core import mapping
+from mipsjax.core import mapping, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.state import Keyframe, Pose, Submap, rigid
@@ -38,6 +39,23 @@ def make_keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camer
 def mapping_camera(camera: Intrinsics, cfg: Config) -> Intrinsics:
     """Of the images of a keyframe."""
     return camera.decimated(mapping_stride(camera, cfg))
+
+
+def unprojected(
+    keyframe: Keyframe, camera: Intrinsics, far: float, every: int, cfg: Config
+) -> Float64[np.ndarray, "N 3"]:
+    """What a keyframe measured up to `far` metres, at one pixel in `every` along both axes: submap frame, metres.
+
+    `camera` is that of the sequence.
+    """
+    small = mapping_camera(camera, cfg)
+    depth = keyframe.depth[::every, ::every].astype(np.float64)
+    v, u = np.nonzero((depth > 0) & (depth <= far))
+    z = depth[v, u]
+    p_cam = np.stack(
+        [(u * every - small.cx) / small.fx * z, (v * every - small.cy) / small.fy * z, z], axis=1
+    )
+    return volume.moved(keyframe.T_sub_cam, p_cam)
 
 
 def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:

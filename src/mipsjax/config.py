@@ -227,6 +227,9 @@ class GuardConfig:
     """Share of known pixels below which a frame is weak: mapped, but the next search is wider."""
     lost: float = 0.4
     """Share of known pixels below which a frame is lost: never mapped."""
+    confirmed: float = 0.25
+    """The same, of known pixels of which the map is certain: in space that was never observed everything looks like
+    surface. Frames of sequences that are tracked well have 0.5 to 1."""
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,7 @@ RANGES: dict[str, Range] = {
     "keyframe.rotation": SWITCH,
     "guard.weak": SHARE,
     "guard.lost": SHARE,
+    "guard.confirmed": SHARE,
     "volume.far": POSITIVE,
     "volume.max_side": POSITIVE,
     "volume.overlap": SHARE,

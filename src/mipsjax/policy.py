@@ -28,6 +28,8 @@ class FrameStats(NamedTuple):
     finite: bool
     known: float
     """Share of measured pixels within KeyframeConfig.error of the mapped surface, 0..1."""
+    confirmed: float
+    """The same where the map is certain."""
     since_keyframe: int
     """Processed frames since the last keyframe."""
     translation: float
@@ -97,7 +99,7 @@ def converged(residual: float, cfg: Config) -> float:
 
 
 def _status(stats: FrameStats, cfg: Config) -> Status:
-    if not stats.finite or stats.known < cfg.guard.lost:
+    if not stats.finite or stats.known < cfg.guard.lost or stats.confirmed < cfg.guard.confirmed:
         return Status.LOST
     return Status.WEAK if stats.known < cfg.guard.weak else Status.OK
 

@@ -11,12 +11,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Float32, Float64
 
-from mipsjax.bundle import mapping_camera
+from mipsjax.bundle import unprojected
 from mipsjax.config import Config
 from mipsjax.core import blend, volume
-from mipsjax.core.camera import Intrinsics
 from mipsjax.host.meshing import extract
-from mipsjax.state import Keyframe, Pose, SlamState, inverse
+from mipsjax.state import SlamState, inverse
 
 CHUNK_POINTS = 65536
 """Points of one compiled call: few calls for a room, tens of megabytes of activations."""
@@ -52,24 +51,12 @@ def reconstruct(state: SlamState, cfg: Config, voxel_m: float | None = None) -> 
 
 def observed_points(state: SlamState, cfg: Config) -> Float32[np.ndarray, "N 3"]:
     """What all keyframes measured up to `cfg.mesh.depth_max`: points in the world frame, metres."""
-    camera = mapping_camera(state.camera, cfg)
     parts = [
-        _unprojected(keyframe, camera, submap.T_world_sub, cfg)
+        volume.moved(submap.T_world_sub, unprojected(keyframe, state.camera, cfg.mesh.depth_max, 1, cfg))
         for submap in state.submaps
         for keyframe in submap.keyframes
     ]
-    return np.concatenate(parts)
-
-
-def _unprojected(
-    keyframe: Keyframe, camera: Intrinsics, T_world_sub: Pose, cfg: Config
-) -> Float32[np.ndarray, "N 3"]:
-    v, u = np.nonzero((keyframe.depth > 0) & (keyframe.depth <= cfg.mesh.depth_max))
-    depth = keyframe.depth[v, u].astype(np.float64)
-    p_cam = np.stack(
-        [(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth], axis=1
-    )
-    return volume.moved(T_world_sub @ keyframe.T_sub_cam, p_cam).astype(np.float32)
+    return np.concatenate(parts).astype(np.float32)
 
 
 def _blended(

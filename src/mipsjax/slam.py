@@ -74,7 +74,8 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     stats = _stats(state, T_sub_cam, info)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
-        return _recover(taken_over(state, executor), frame, f"known {stats.known:.2f}", info, track_ms, cfg)
+        note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}"
+        return _recover(taken_over(state, executor), frame, note, info, track_ms, cfg)
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
     state = _moved_on(learned, state, float(info.after.residual))
     if state.records[-1].info.keyframe:
@@ -257,6 +258,7 @@ def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> Frame
     return FrameStats(
         finite=bool(info.ok),
         known=float(info.after.known),
+        confirmed=float(info.after.confirmed),
         since_keyframe=len(state.records) - keyframe.number,
         translation=translation,
         rotation=rotation,

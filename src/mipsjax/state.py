@@ -185,6 +185,12 @@ def keyframes(state: SlamState) -> int:
     return len({keyframe.number for submap in state.submaps for keyframe in submap.keyframes})
 
 
+def keyframe_bytes(keyframe: Keyframe) -> int:
+    """Size of its images and features; a keyframe of several submaps is kept once."""
+    features = keyframe.features or ()
+    return keyframe.depth.nbytes + keyframe.color.nbytes + sum(part.nbytes for part in features)
+
+
 def map_bytes(state: SlamState) -> int:
     """Size of the networks of all submaps."""
     return sum(leaf.nbytes for submap in state.submaps for leaf in jax.tree.leaves(submap.learned.field))

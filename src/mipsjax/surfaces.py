@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from mipsjax.bundle import mapping_camera
+from mipsjax.bundle import unprojected
 from mipsjax.config import Config
 from mipsjax.core import correspond, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.host.factors import PointToPlane, RelativePose
 from mipsjax.links import Link, best_link, links, sigmas
-from mipsjax.state import Keyframe, Pose, Submap
+from mipsjax.state import Pose, Submap
 
 EVERY = 3  # pixels between the measured points from which surface points are sought
 ROUNDS = 4  # of matching and aligning: the pairs change as the submaps come closer
@@ -83,7 +83,8 @@ def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> 
 
 def _surface(pair: Pair, camera: Intrinsics, cfg: Config) -> correspond.Surface:
     """Of the first submap, in the frames that both share."""
-    measured = [_unprojected(link.first, camera, cfg) for link in links(pair.first, pair.second)]
+    shared = [link.first for link in links(pair.first, pair.second)]
+    measured = [unprojected(keyframe, camera, cfg.volume.far, EVERY, cfg) for keyframe in shared]
     start, mask = correspond.fixed_size(np.concatenate(measured), cfg)
     return correspond.surface_points(pair.first.learned.field, jnp.asarray(start), jnp.asarray(mask), cfg)
 
@@ -114,13 +115,3 @@ def _misfit(factor: PointToPlane, T_first_second: Pose) -> float:
     """Median distance across the surface, metres."""
     q_first = volume.moved(T_first_second, factor.q_second)
     return float(np.median(np.abs(np.sum((factor.p_first - q_first) * factor.n_first, 1))))
-
-
-def _unprojected(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> Float64[np.ndarray, "N 3"]:
-    """Measured points of a keyframe, submap frame, metres."""
-    small = mapping_camera(camera, cfg)
-    v, u = (x.ravel() for x in np.mgrid[0 : small.height : EVERY, 0 : small.width : EVERY])
-    depth = keyframe.depth[v, u].astype(np.float64)
-    ray = np.stack([(u - small.cx) / small.fx, (v - small.cy) / small.fy, np.ones(len(u))], 1)
-    p_cam = (ray * depth[:, None])[(depth > 0) & (depth < cfg.volume.far)]
-    return volume.moved(keyframe.T_sub_cam, p_cam)
