@@ -16,15 +16,17 @@ import numpy as np
 
 from mipsjax import slam
 from mipsjax.config import Config
+from mipsjax.core.camera import Intrinsics
 from mipsjax.data.open import open_sequence
-from mipsjax.data.sequence import Sequence
+from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.final import finish
 from mipsjax.host.metrics import absolute_error, relative_error
-from mipsjax.state import SlamState, keyframes, map_bytes, trajectory
+from mipsjax.state import Pose, SlamState, keyframes, map_bytes, trajectory
 
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"
 WARM_UP = 5  # frames after which the clock starts: by then everything is compiled
+RATE = 30.0  # frames a second
 EARLY = 200  # frames after which memory is noted, to be compared with the end
 
 
@@ -72,6 +74,19 @@ def run(
         "peak_online_mb": loop_peak,
     }
     return Run(state, sequence, row | figures(state, sequence) | speed)
+
+
+def follow(frames: Iterable[Frame], camera: Intrinsics, cfg: Config, T_world_cam: Pose) -> SlamState:
+    """The state after frames of any order, numbered and stamped anew; `T_world_cam` is the true pose of the first."""
+    state = None
+    for number, frame in enumerate(frames):
+        frame = frame._replace(number=number, timestamp=number / RATE)
+        if state is None:
+            state = slam.start(frame, camera, cfg, T_world_cam)
+            continue
+        state = slam.step(state, frame, cfg)
+    assert state is not None
+    return state
 
 
 def figures(state: SlamState, sequence: Sequence) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from compilations import compilations
-from mipsjax import slam
+from mipsjax import schedule, slam
 from mipsjax.config import Config, InputConfig, LoopConfig, VolumeConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
@@ -51,12 +51,19 @@ def truth(sequence) -> np.ndarray:
     return np.linalg.inv(poses[0]) @ poses
 
 
-def run(frames: list[Frame], camera, cfg: Config = CFG) -> list[SlamState]:
+def run(
+    frames: list[Frame], camera, cfg: Config = CFG, executor: schedule.Executor = schedule.INLINE
+) -> list[SlamState]:
     """The state after each frame."""
     states = [slam.start(frames[0], camera, cfg)]
     for frame in frames[1:]:
-        states.append(slam.step(states[-1], frame, cfg))
+        states.append(slam.step(states[-1], frame, cfg, executor))
     return states
+
+
+def same_submaps(one: SlamState, other: SlamState) -> bool:
+    leaves = zip(*(jax.tree.leaves(state.submaps) for state in (one, other)), strict=True)
+    return all(np.array_equal(a, b) for a, b in leaves)
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +125,27 @@ def test_a_second_run_gives_the_same_bits_and_compiles_nothing(states, frames, s
         again = run(frames, sequence.intrinsics)[-1]
     assert not compiled, "a new submap and a switch compile nothing"
     np.testing.assert_array_equal(trajectory(again), trajectory(states[-1]))
-    same = zip(*(jax.tree.leaves(s.submaps) for s in (again, states[-1])), strict=True)
-    assert all(np.array_equal(a, b) for a, b in same)
+    assert same_submaps(again, states[-1])
+
+
+def test_refinement_in_a_thread_gives_the_same_bits(states, frames, sequence):
+    with schedule.executor("thread") as beside:
+        again = run(frames, sequence.intrinsics, CFG, beside)[-1]
+        finished = finish(again, CFG, beside)
+    np.testing.assert_array_equal(trajectory(again), trajectory(states[-1]))
+    assert same_submaps(again, states[-1])
+    assert again.refinement is not None and finished.refinement is None
+    assert same_submaps(finished, finish(states[-1], CFG))
+
+
+def test_a_refinement_is_taken_over_before_its_submap_is_entered(states):
+    """And one that is under way leaves its submap as it was."""
+    for before, after in pairwise(states):
+        if after.refinement is not None:
+            assert after.active not in after.refinement.places
+        if before.refinement is not None and before.refinement is after.refinement:
+            for place in before.refinement.places:
+                assert after.submaps[place].learned is before.submaps[place].learned
 
 
 def test_without_loops_submaps_stay_where_they_were_begun(frames, sequence):

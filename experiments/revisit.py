@@ -1,0 +1,87 @@
+"""Poses where the camera enters a known submap again, with and without bundle adjustment before it.
+
+    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--seed 0]
+
+The first frames of a synthetic scene and the same backwards, so that submaps are left and entered again with the drift
+of the way between, and loop closure on and off. RPE over one frame (translation, cm). Writes `revisit.csv`, a row each
+variant with the RPE in the 10 frames from a revisit on and elsewhere, and a plot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from common import OUT, changed, follow, show, use_compilation_cache, write_rows
+from mipsjax.config import Config
+from mipsjax.data.open import open_sequence
+from mipsjax.host.metrics import absolute_error
+from mipsjax.state import trajectory
+
+AROUND = 10  # frames after a revisit
+VARIANTS = {
+    "with": (10, True),
+    "without": (0, True),
+    "with, no loop closure": (10, False),
+    "without, no loop closure": (0, False),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--name", default="apartment+noise")
+    parser.add_argument("--frames", type=int, default=450)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    use_compilation_cache()
+    figure, axes = plt.subplots(len(VARIANTS), 1, figsize=(9, 9), sharex=True, sharey=True)
+    rows = []
+    for (title, (steps, loop)), axis in zip(VARIANTS.items(), axes, strict=True):
+        cfg = changed(Config(seed=options.seed), "map", revisit_steps=steps)
+        rpe, active, ate = trial(options.name, options.frames, changed(cfg, "loop", enabled=loop))
+        entered = [i for i, (a, b) in enumerate(pairwise(active)) if b < a]
+        near = np.zeros(len(rpe), bool)
+        for i in entered:
+            near[i : i + AROUND] = True
+        rows.append(
+            {
+                "variant": title,
+                "seed": options.seed,
+                "revisits": len(entered),
+                "rpe_at_cm": float(np.sqrt(np.mean(rpe[near] ** 2))) if entered else float("nan"),
+                "rpe_at_max_cm": float(rpe[near].max()) if entered else float("nan"),
+                "rpe_elsewhere_cm": float(np.sqrt(np.mean(rpe[~near] ** 2))),
+                "rpe_elsewhere_max_cm": float(rpe[~near].max()),
+                "ate_cm": ate,
+            }
+        )
+        show(rows[-1])
+        write_rows("revisit", rows)
+        axis.plot(rpe, linewidth=0.8)
+        for i in entered:
+            axis.axvline(i, color="red", linestyle="--", linewidth=0.8)
+        axis.set(ylabel="RPE, cm", title=f"bundle adjustment at the revisit: {title}")
+    axes[-1].set_xlabel("frame; red: a known submap is entered again")
+    figure.tight_layout()
+    figure.savefig(OUT / "revisit.png", dpi=110)
+
+
+def trial(name: str, count: int, cfg: Config) -> tuple[np.ndarray, list[int], float]:
+    """RPE of each frame (cm), the submap of each, and ATE (cm)."""
+    sequence = open_sequence(f"synth:{name}", frames=slice(0, count), input=cfg.input)
+    order = [*range(count), *range(count - 2, -1, -1)]
+    truth = sequence.T_world_cam[order]
+    state = follow((sequence[i] for i in order), sequence.intrinsics, cfg, truth[0])
+    poses = trajectory(state)
+    moves, true_moves = (np.linalg.inv(p[:-1]) @ p[1:] for p in (poses, truth))
+    rpe = 100 * np.linalg.norm((np.linalg.inv(true_moves) @ moves)[:, :3, 3], axis=1)
+    return rpe, [record.submap for record in state.records], 100 * absolute_error(poses, truth).rmse_m
+
+
+if __name__ == "__main__":
+    main()
