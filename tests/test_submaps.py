@@ -20,6 +20,7 @@ from mipsjax.policy import Status
 from mipsjax.presets import PRESETS
 from mipsjax.reconstruct import reconstruct
 from mipsjax.state import SlamState, distance, trajectory, world_pose
+from mipsjax.surfaces import pair_of, plane_factor
 
 CFG = replace(
     PRESETS["tiny"],
@@ -126,6 +127,23 @@ def test_a_second_run_gives_the_same_bits_and_compiles_nothing(states, frames, s
     assert not compiled, "a new submap and a switch compile nothing"
     np.testing.assert_array_equal(trajectory(again), trajectory(states[-1]))
     assert same_submaps(again, states[-1])
+
+
+def test_nothing_compiles_after_the_first_frames(frames, sequence):
+    """Not when a submap begins or is entered again, nor when the graph is solved, here with every keyframe."""
+    cfg = replace(CFG, loop=replace(CFG.loop, tolerance=1e-6))
+    jax.clear_caches()
+    state = slam.start(frames[0], sequence.intrinsics, cfg)
+    for frame in frames[1:4]:
+        state = slam.step(state, frame, cfg)
+    with compilations() as compiled:
+        for frame in frames[4:]:
+            state = slam.step(state, frame, cfg)
+        # As if the second had not been begun from the first, so that meeting again is a loop
+        apart = tuple(submap._replace(parent=None) for submap in state.submaps)
+        plane_factor(pair_of(apart, (0, 1)), True, state.camera, cfg)
+    assert len(state.submaps) == 2 and state.submaps[0].keyframes[-1].number > FRAMES
+    assert not compiled
 
 
 def test_refinement_in_a_thread_gives_the_same_bits(states, frames, sequence):

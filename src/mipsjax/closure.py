@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mipsjax import surfaces
 from mipsjax.bundle import MATCH
 from mipsjax.config import Config
 from mipsjax.host.factors import Factor
@@ -15,6 +16,13 @@ from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
 
 DOUBT = 3.0  # standard deviations of the drift beyond which a shared frame is taken for a false one
+
+
+def prepare(state: SlamState, cfg: Config) -> None:
+    """Compiles, on the first submap alone, what the first meeting of two submaps will need."""
+    sight(state, 0, state.submap.keyframes[0], np.eye(4), cfg)
+    if cfg.loop.enabled:
+        surfaces.prepare(state.submap, state.camera, cfg)
 
 
 def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Config) -> Sighting | None:

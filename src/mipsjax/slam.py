@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mipsjax.background import refine_inactive, taken_over
 from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine
-from mipsjax.closure import close
+from mipsjax.closure import close, prepare
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.core.camera import Intrinsics
@@ -58,7 +58,9 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
         keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
     )
     record = Record(frame.number, frame.timestamp, 0, 0, np.eye(4), Status.OK, info)
-    return SlamState((submap,), 0, (record,), camera, 0)
+    state = SlamState((submap,), 0, (record,), camera, 0)
+    prepare(state, cfg)
+    return state
 
 
 def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLINE) -> SlamState:

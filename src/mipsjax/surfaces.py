@@ -81,6 +81,13 @@ def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> 
     return found._replace(trusted=trusted)
 
 
+def prepare(submap: Submap, camera: Intrinsics, cfg: Config) -> None:
+    """Compiles what two submaps will need, on one submap and itself."""
+    anchor = submap.keyframes[0]
+    itself = Pair(submap, submap, Link(anchor, anchor), (0, 0))
+    _matched(itself, _surface(itself, camera, cfg), np.eye(4), cfg)
+
+
 def _surface(pair: Pair, camera: Intrinsics, cfg: Config) -> correspond.Surface:
     """Of the first submap, in the frames that both share."""
     shared = [link.first for link in links(pair.first, pair.second)]
