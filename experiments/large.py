@@ -115,7 +115,7 @@ def plan(done: Run, T: Pose, path: str) -> None:
 
 
 class Memory:
-    """Resident memory each time the number of submaps has grown."""
+    """Resident memory, without what other processes could share, each time the number of submaps has grown."""
 
     def __init__(self, about: dict[str, Any]) -> None:
         self.rows: list[dict[str, Any]] = []
@@ -124,12 +124,16 @@ class Memory:
     def __call__(self, state: SlamState) -> None:
         if not self.rows or self.rows[-1]["submaps"] != len(state.submaps):
             with open("/proc/self/statm") as file:
-                resident = int(file.read().split()[1]) * 4096 / 2**20
+                _, resident, shared, *_ = (int(pages) * 4096 / 2**20 for pages in file.read().split())
             kept = {k.number: k for submap in state.submaps for k in submap.keyframes}
             pixels = sum(keyframe_bytes(k) for k in kept.values())
             self.rows.append(
                 self._about
-                | {"frame": len(state.records), "submaps": len(state.submaps), "resident_mb": resident}
+                | {
+                    "frame": len(state.records),
+                    "submaps": len(state.submaps),
+                    "resident_mb": resident - shared,
+                }
                 | {"keyframes_mb": pixels / 2**20}
             )
 
