@@ -353,10 +353,11 @@ class BlendConfig:
 
     entropy_floor: float = 0.3
     """Nats; bounds the weight 1 / h^2 of a certain point."""
-    fade: float = 0.05
-    """Metres inside the faces of a box over which the weight of its submap falls to zero, so that there is no step
-    where a submap ends within another; 0 is none, as in the paper. At most `volume.margin`, or measured surface
-    near a face has little weight."""
+    noise_floor: float = 0.005
+    """Metres, standard deviation of depth measured close by. A submap that measured a surface from nearer counts for
+    more, by the inverse variance; one that did not measure it counts for nothing. Not in the paper."""
+    noise_growth: float = 0.002
+    """Metres, the same at one metre; it grows with the square of the range. 0 is the paper's weight."""
 
 
 @dataclass(frozen=True)

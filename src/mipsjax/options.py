@@ -161,7 +161,8 @@ RANGES: dict[str, Range] = {
     "correspond.max_gradient": POSITIVE,
     "correspond.max_angle": Range(0.0, RIGHT_ANGLE, above=True),
     "blend.entropy_floor": POSITIVE,
-    "blend.fade": NOT_NEGATIVE,
+    "blend.noise_floor": POSITIVE,
+    "blend.noise_growth": NOT_NEGATIVE,
     "mesh.voxel": Range(1e-3),
     "mesh.margin": POSITIVE,
     "mesh.band": POSITIVE,
@@ -177,7 +178,6 @@ NOT_BELOW = (
     ("field.truncation", "mesh.band"),
     ("guard.weak", "guard.lost"),
     ("correspond.max_gradient", "correspond.min_gradient"),
-    ("volume.margin", "blend.fade"),
 )
 """Pairs whose first field must not be below the second."""
 

@@ -45,7 +45,7 @@ PAPER = Config(
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
-    blend=BlendConfig(fade=0.0),
+    blend=BlendConfig(noise_growth=0.0),
 )
 TINY = Config(
     field=FieldConfig(

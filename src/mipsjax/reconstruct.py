@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int
 
 from mipsjax.bundle import unprojected
-from mipsjax.config import Config
+from mipsjax.config import BlendConfig, Config
 from mipsjax.core import blend, volume
 from mipsjax.host.meshing import extract
-from mipsjax.state import SlamState, inverse
+from mipsjax.host.observed import Observed, observe, range_at
+from mipsjax.state import Keyframe, SlamState, Submap, inverse
 
 CHUNK_POINTS = 65536
 """Points of one compiled call: few calls for a room, tens of megabytes of activations."""
@@ -37,12 +38,13 @@ def reconstruct(state: SlamState, cfg: Config, voxel_m: float | None = None) -> 
     """
     mesh = cfg.mesh
     voxel_m = mesh.voxel if voxel_m is None else voxel_m
+    blended = Blend(state, cfg)
     return extract(
-        lambda points: _blended(state, points, lambda b: (b.psi, b.entropy), cfg, colored=False),
+        lambda points: blended(points, lambda b: (b.psi, b.entropy), colored=False),
         observed_points(state, cfg),
         voxel_m,
         margin_m=max(mesh.margin, MARGIN_VOXELS * voxel_m),
-        color=lambda points: _blended(state, points, lambda b: b.color, cfg, colored=True),
+        color=lambda points: blended(points, lambda b: b.color, colored=True),
         band_m=mesh.band,
         max_entropy=mesh.max_entropy * np.log(cfg.field.classes) if cfg.field.classification else None,
         min_component_m2=mesh.min_component_m2,
@@ -52,36 +54,72 @@ def reconstruct(state: SlamState, cfg: Config, voxel_m: float | None = None) -> 
 def observed_points(state: SlamState, cfg: Config) -> Float32[np.ndarray, "N 3"]:
     """What all keyframes measured up to `cfg.mesh.depth_max`: points in the world frame, metres."""
     parts = [
-        volume.moved(submap.T_world_sub, unprojected(keyframe, state.camera, cfg.mesh.depth_max, 1, cfg))
+        volume.moved(submap.T_world_sub, _measured(state, keyframe, cfg))
         for submap in state.submaps
         for keyframe in submap.keyframes
     ]
     return np.concatenate(parts).astype(np.float32)
 
 
-def _blended(
-    state: SlamState, points: Points, wanted: Callable[[blend.Blended], Any], cfg: Config, colored: bool
-) -> Any:
-    """What is wanted of the blend at points of the world, in padded chunks of one size: one compilation."""
-    count = len(points)
-    padded = np.zeros((max(1, -(-count // CHUNK_POINTS)) * CHUNK_POINTS, 3))
-    padded[:count] = points
-    chunks = padded.reshape(-1, CHUNK_POINTS, 3)
-    parts = [jax.device_get(wanted(_blend_chunk(state, chunk, cfg, colored))) for chunk in chunks]
-    return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
+def _measured(state: SlamState, keyframe: Keyframe, cfg: Config) -> Float64[np.ndarray, "N 3"]:
+    return unprojected(keyframe, state.camera, cfg.mesh.depth_max, 1, cfg)
 
 
-def _blend_chunk(
-    state: SlamState, points: Float64[np.ndarray, "C 3"], cfg: Config, colored: bool
-) -> blend.Blended:
-    """Over the submaps in whose box a point is. They are taken around the chunk's middle, which keeps float32 exact."""
-    total, middle = blend.start(CHUNK_POINTS, cfg.field), np.eye(4)
-    middle[:3, 3] = points.mean(0)
-    near = jnp.asarray(points - middle[:3, 3], jnp.float32)
-    for submap in state.submaps:
-        T_sub_world = inverse(submap.T_world_sub)
-        if volume.inside(submap.box, volume.moved(T_sub_world, points)).any():
-            T = jnp.asarray(T_sub_world @ middle, jnp.float32)
-            lo, hi = (jnp.asarray(face, jnp.float32) for face in submap.box)
-            total = blend.add(total, submap.learned.field, T, lo, hi, near, cfg, colored)
-    return total
+class Blend:
+    """The blend of all submaps as a function of points of the world, metres."""
+
+    def __init__(self, state: SlamState, cfg: Config) -> None:
+        self._state, self._cfg = state, cfg
+        self._observed = [self._of_submap(submap) for submap in state.submaps]
+
+    def _of_submap(self, submap: Submap) -> Observed:
+        points = [_measured(self._state, keyframe, self._cfg) for keyframe in submap.keyframes]
+        ranges = [
+            np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
+            for p, k in zip(points, submap.keyframes, strict=True)
+        ]
+        return observe(np.concatenate(points), np.concatenate(ranges))
+
+    def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:
+        """What is wanted of the blend, in padded chunks of one size: one compilation."""
+        count = len(points)
+        padded = np.zeros((max(1, -(-count // CHUNK_POINTS)) * CHUNK_POINTS, 3))
+        padded[:count] = points
+        chunks = padded.reshape(-1, CHUNK_POINTS, 3)
+        parts = [jax.device_get(wanted(self._chunk(chunk, colored))) for chunk in chunks]
+        return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
+
+    def nearest(self, points: Points) -> Int[np.ndarray, " N"]:
+        """The submap that measured near each point from nearest, and has the largest trust; -1 where none did."""
+        ranges = np.stack(
+            [
+                range_at(observed, volume.moved(inverse(submap.T_world_sub), points))
+                for submap, observed in zip(self._state.submaps, self._observed, strict=True)
+            ]
+        )
+        return np.where(np.isfinite(ranges.min(0)), ranges.argmin(0), -1)
+
+    def _chunk(self, points: Float64[np.ndarray, "C 3"], colored: bool) -> blend.Blended:
+        """Over the submaps that have measured near a point, which need not be in their boxes.
+
+        They are taken around the chunk's middle, which keeps float32 exact.
+        """
+        cfg = self._cfg
+        total, middle = blend.start(CHUNK_POINTS, cfg.field), np.eye(4)
+        middle[:3, 3] = points.mean(0)
+        near = jnp.asarray(points - middle[:3, 3], jnp.float32)
+        for submap, observed in zip(self._state.submaps, self._observed, strict=True):
+            T_sub_world = inverse(submap.T_world_sub)
+            there = volume.moved(T_sub_world, points)
+            trust = _trust(range_at(observed, there), cfg.blend)
+            if (trust > 0).any():
+                T = jnp.asarray(T_sub_world @ middle, jnp.float32)
+                total = blend.add(total, submap.learned.field, T, jnp.asarray(trust), near, cfg, colored)
+        return total
+
+
+def _trust(range_m: Float32[np.ndarray, " N"], cfg: BlendConfig) -> Float32[np.ndarray, " N"]:
+    """Inverse variance of depth measured from a range, 1 close by, 0 where nothing was measured."""
+    measured = np.isfinite(range_m)
+    noise = cfg.noise_growth * np.where(measured, range_m, 0) ** 2 / cfg.noise_floor
+    return np.where(measured, 1 / (1 + noise**2), 0).astype(np.float32)

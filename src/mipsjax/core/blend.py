@@ -1,7 +1,7 @@
 """The distance and the colour over any number of submaps (Eq. 1 of the paper).
 
 `start`, then `add` for each submap in any order: after each the blend is that of the submaps so far. A submap's
-parameters, pose and box are arguments like any other, so that one compilation serves any number of them.
+parameters and pose are arguments like any other, so that one compilation serves any number of them.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from mipsjax.config import Config, FieldConfig
 from mipsjax.core import field as nf
 from mipsjax.core import losses
 from mipsjax.core.camera import transform
-
-STEP = 1e-6  # metres; a fade as short as this is none
 
 
 class Blended(NamedTuple):
@@ -46,24 +44,22 @@ def add(
     total: Blended,
     field: nf.Field,
     T_sub_world: Float[Array, "4 4"],
-    lo: Float[Array, "3"],
-    hi: Float[Array, "3"],
+    trust: Float[Array, " N"],
     p_world: Float[Array, "N 3"],
     cfg: Config,
     colored: bool = True,
 ) -> Blended:
-    """The blend with one more submap, whose box is `lo` to `hi` in its own frame, metres.
+    """The blend with one more submap.
 
-    Its weight is 1 / h^2, bounded as in tracking, and nothing outside its box. The means are running ones: a
-    submap alone gives its own values exactly. Points where a submap is not finite are left to the others.
+    Its weight is `trust` (0..1; 0 where it says nothing) times 1 / h^2, bounded as in tracking. The means are running
+    ones: a submap alone gives its own values exactly. Points where a submap is not finite are left to the others.
     Without `colored` the colour stays as it is, for less work.
     """
-    p_sub = transform(T_sub_world, p_world)
-    encoded = nf.encode(field, p_sub, cfg.field)
+    encoded = nf.encode(field, transform(T_sub_world, p_world), cfg.field)
     net = field.smooth if field.fine is None else field.fine
     assert net is not None
     psi, entropy, _ = nf.classify(net, encoded, cfg.field)
-    weight = losses.certainty(entropy, cfg.blend.entropy_floor) * fading(p_sub, lo, hi, cfg.blend.fade)
+    weight = trust * losses.certainty(entropy, cfg.blend.entropy_floor)
     used = (weight > 0) & jnp.isfinite(psi)
     together = total.weight + jnp.where(used, weight, 0.0)
     share = jnp.where(used, weight / jnp.where(used, together, 1.0), 0.0)
@@ -74,12 +70,3 @@ def add(
 
     color = mean(total.color, nf.decode_color(field, encoded)) if colored else total.color
     return Blended(mean(total.psi, psi), mean(total.entropy, entropy), color, together)
-
-
-def fading(
-    p_sub: Float[Array, "N 3"], lo: Float[Array, "3"], hi: Float[Array, "3"], fade: float
-) -> Float[Array, " N"]:
-    """1 in a box, 0 outside, with a smooth fall over `fade` metres inside its faces; 0 for NaN."""
-    depth_inside = jnp.min(jnp.minimum(p_sub - lo[None], hi[None] - p_sub), -1)
-    t = jnp.clip(depth_inside / max(fade, STEP), 0, 1)
-    return jnp.where(depth_inside > 0, t * t * (3 - 2 * t), 0.0)
