@@ -3,13 +3,13 @@
     python experiments/large.py [--names corridor-loop+noise apartment+noise no-loop+noise living] [--seeds 0 1 2]
                                 [--switches full no-lc no-si no-sr] [--stride 1] [--no-surface]
 
-`living` is `small_house/living` of the development data. The switches are the paper's: no loop closure, no first fit of
-a new submap (SI), no bundle adjustment at a revisit (SR). ATE RMSE after rigid alignment, over all frames. The mesh is
-moved by that same alignment. Accuracy and completeness by 1,000,000 points on each mesh; the reference is culled to what
-the sensor measured from within 5 m in every 10th frame. A seam, where the scene is analytic: vertices whose nearest view
-is another submap's on both sides of a border, in cells of 0.25 m; the difference between the median signed errors of the
-two sides. Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and for each run a picture of the
-trajectory from above and of the mesh.
+`living` is `small_house/living` of the development data. The switches are the paper's: no loop closure, no first fit
+of a new submap (SI), no bundle adjustment at a revisit (SR). ATE RMSE after rigid alignment, over all frames. The
+mesh is moved by that same alignment. Accuracy and completeness by 1,000,000 points on each mesh; the reference is
+culled to what the sensor measured from within 5 m in every 10th frame. A seam, where the scene is analytic: vertices
+whose nearest view is another submap's on both sides of a border, in cells of 0.25 m; the difference between the
+median signed errors of the two sides. Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and
+for each run a picture of the trajectory from above and of the mesh.
 """
 
 from __future__ import annotations
