@@ -28,7 +28,7 @@ from mipsjax import outputs, slam
 from mipsjax.commandline import Options, parse
 from mipsjax.config import Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
-from mipsjax.data.sequence import Frame, Sequence
+from mipsjax.data.sequence import Sequence
 from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
 from mipsjax.final import finish
 from mipsjax.policy import Status
@@ -41,8 +41,6 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 LINE_EVERY = 50
 """Frames between two lines of progress where there is no terminal."""
-ANCHOR_MEASURED = 0.1
-"""Share of pixels with depth that the first frame of a map needs."""
 MIN_USABLE = 2
 """Frames that make a sequence."""
 CACHE_FROM_S = 0.3
@@ -82,7 +80,7 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
             read_s.append(perf_counter() - began)
             if state is not None:
                 state = slam.step(state, frame, core, beside)
-            elif reason := anchor_problem(frame):
+            elif reason := slam.anchor_problem(frame):
                 waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
             else:
                 state = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
@@ -97,14 +95,6 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
     too_bad = bad > cfg.input.max_bad_frames
     end = "bad frames" if too_bad else "interrupted" if len(read_s) < len(sequence) else "done"
     return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end, finish_s)
-
-
-def anchor_problem(frame: Frame) -> str:
-    """Why a frame cannot start a map; empty if it can."""
-    if frame.color is None or frame.depth is None:
-        return frame.problem or "no image"
-    measured = float(np.mean(frame.depth > 0))
-    return "" if measured >= ANCHOR_MEASURED else f"depth in {100 * measured:.1f} % of the pixels only"
 
 
 def enable_cache() -> None:

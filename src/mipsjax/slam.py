@@ -40,6 +40,8 @@ from mipsjax.state import (
 )
 from mipsjax.territory import begin, enter, govern, settle
 
+ANCHOR_MEASURED = 0.1
+"""Share of pixels with depth that the first frame of a map needs."""
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 RESIDUAL_RISE = 0.02  # share of a frame's excess by which the least residual of late goes up
@@ -61,6 +63,14 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     state = SlamState((submap,), 0, (record,), camera, 0)
     prepare(state, cfg)
     return state
+
+
+def anchor_problem(frame: Frame) -> str:
+    """Why a frame cannot begin a map, or a submap that hangs on nothing; empty if it can."""
+    if frame.color is None or frame.depth is None:
+        return frame.problem or "no image"
+    measured = float(np.mean(frame.depth > 0))
+    return "" if measured >= ANCHOR_MEASURED else f"depth in {100 * measured:.1f} % of the pixels only"
 
 
 def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLINE) -> SlamState:
@@ -110,7 +120,7 @@ def _recover(
         place = find_again(state, keyframe, cfg)
         if place is not None:
             found = "again"
-        elif lost_in_a_row(state) >= cfg.loop.patience:
+        elif lost_in_a_row(state) >= cfg.loop.patience and not anchor_problem(frame):
             place, found = start_anew(state, keyframe, cfg), "nowhere"
     if place is None:
         return _coast(state, frame, note, Status.LOST, cfg, info, track_ms)
