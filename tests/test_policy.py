@@ -21,6 +21,9 @@ PLAIN = FrameStats(
     finite=True,
     known=0.9,
     confirmed=0.8,
+    residual=0.01,
+    least_residual=0.008,
+    unsure=False,
     since_keyframe=5,
     translation=0.05,
     rotation=0.02,
@@ -50,6 +53,17 @@ def test_a_frame_that_fits_only_where_nothing_was_observed_is_lost():
     limit = CFG.guard.confirmed
     assert decide(PLAIN._replace(confirmed=limit), CFG).status is Status.OK
     assert decide(PLAIN._replace(confirmed=limit - 0.01), CFG).status is Status.LOST
+
+
+def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
+    assert decide(PLAIN._replace(residual=0.019), CFG).status is Status.OK
+    assert decide(PLAIN._replace(residual=0.021), CFG).status is Status.LOST
+    unsure = PLAIN._replace(unsure=True)
+    assert decide(unsure._replace(residual=0.011), CFG).status is Status.OK
+    assert decide(unsure._replace(residual=0.013), CFG).status is Status.LOST
+    noisy = PLAIN._replace(least_residual=0.02)
+    assert decide(noisy._replace(residual=0.029), CFG).status is Status.OK
+    assert decide(noisy._replace(residual=0.031), CFG).status is Status.LOST
 
 
 @pytest.mark.parametrize(

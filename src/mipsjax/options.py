@@ -128,6 +128,7 @@ RANGES: dict[str, Range] = {
     "guard.weak": SHARE,
     "guard.lost": SHARE,
     "guard.confirmed": SHARE,
+    "guard.residual": SWITCH,
     "volume.far": POSITIVE,
     "volume.max_side": POSITIVE,
     "volume.overlap": SHARE,

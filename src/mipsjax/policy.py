@@ -30,6 +30,12 @@ class FrameStats(NamedTuple):
     """Share of measured pixels within KeyframeConfig.error of the mapped surface, 0..1."""
     confirmed: float
     """The same where the map is certain."""
+    residual: float
+    """Metres."""
+    least_residual: float
+    """Of late; 0 if none is known."""
+    unsure: bool
+    """The frame before was lost or skipped."""
     since_keyframe: int
     """Processed frames since the last keyframe."""
     translation: float
@@ -50,6 +56,9 @@ class Decision(NamedTuple):
     map_steps: int
     pose_rate: float
     """Share of the pose learning rate in local bundle adjustment."""
+
+
+NOISE = 1.5  # times the least residual of late: no frame of that sensor is worse
 
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
@@ -99,7 +108,12 @@ def converged(residual: float, cfg: Config) -> float:
 
 
 def _status(stats: FrameStats, cfg: Config) -> Status:
-    if not stats.finite or stats.known < cfg.guard.lost or stats.confirmed < cfg.guard.confirmed:
+    guard = cfg.guard
+    unknown = stats.known < guard.lost or stats.confirmed < guard.confirmed
+    limit = max(guard.residual, NOISE * stats.least_residual)
+    if stats.unsure:  # something else may look like the place that it was: it must fit as well as usual
+        limit = min(limit, converged(stats.least_residual, cfg))
+    if not stats.finite or unknown or stats.residual > limit:
         return Status.LOST
     return Status.WEAK if stats.known < cfg.guard.weak else Status.OK
 

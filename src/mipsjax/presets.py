@@ -40,7 +40,7 @@ PAPER = Config(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
     ),
-    guard=GuardConfig(confirmed=0.0),
+    guard=GuardConfig(weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf")),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, pose_rate=1.0),
@@ -66,7 +66,9 @@ TINY = Config(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
         go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
     ),
-    guard=GuardConfig(confirmed=0.0),  # so few steps leave every point uncertain
+    guard=GuardConfig(
+        weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf")
+    ),  # so few steps leave every point uncertain
     mesh=MeshConfig(voxel=0.05),
 )
 PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

@@ -86,7 +86,7 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     stats = _stats(state, T_sub_cam, info)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
-        note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}"
+        note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}, residual {1e3 * stats.residual:.0f} mm"
         return _recover(taken_over(state, executor), frame, note, info, track_ms, cfg)
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
     state = _moved_on(learned, state, float(info.after.residual))
@@ -271,6 +271,9 @@ def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> Frame
         finite=bool(info.ok),
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
+        residual=float(info.after.residual),
+        least_residual=state.residual,
+        unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),
         since_keyframe=len(state.records) - keyframe.number,
         translation=translation,
         rotation=rotation,
