@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from math import log
+from math import inf, log
 from typing import NamedTuple
 
 from mipsjax.config import Config
@@ -111,7 +111,7 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     guard = cfg.guard
     unknown = stats.known < guard.lost or stats.confirmed < guard.confirmed
     limit = max(guard.residual, NOISE * stats.least_residual)
-    if stats.unsure:  # something else may look like the place that it was: it must fit as well as usual
+    if stats.unsure and limit < inf:  # what fits there may be another place: it must fit as well as usual
         limit = min(limit, converged(stats.least_residual, cfg))
     if not stats.finite or unknown or stats.residual > limit:
         return Status.LOST
