@@ -16,7 +16,7 @@ import jaxlie
 import numpy as np
 
 from common import changed, show, use_compilation_cache, write_rows
-from mipsjax.bundle import adjust, make_keyframe
+from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking
 from mipsjax.data.open import open_sequence
@@ -38,9 +38,8 @@ def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Learned, list[np.nd
     rng = np.random.default_rng(cfg.seed)
     for number in range(STEPS // cfg.map.steps):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
-        submap, _, _ = adjust(
-            submap, batch, [0.0] * cfg.map.frames, cfg.map.steps, number, sequence.intrinsics, cfg
-        )
+        rates, key = [0.0] * cfg.map.frames, random_key(cfg, MAP, number)
+        submap, _, _ = adjust(submap, batch, rates, cfg.map.steps, key, sequence.intrinsics, cfg)
     return submap, list(truth)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common import changed, show, use_compilation_cache, write_rows
-from mipsjax.bundle import adjust, make_keyframe
+from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
 from mipsjax.closure import recognise, solve
 from mipsjax.config import Config
 from mipsjax.core import mapping, volume
@@ -60,10 +60,8 @@ def submap(sequence: Sequence, first: int, last: int, cfg: Config) -> Submap:
     learned, rng = mapping.create(jax.random.key(first), cfg), np.random.default_rng(first)
     for call in range(CALLS):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
-        rates = [0.0] * len(batch)
-        learned, _, _ = adjust(
-            learned, batch, rates, STEPS, first + call, sequence.intrinsics, cfg, 1 - call / CALLS
-        )
+        rates, key = [0.0] * len(batch), random_key(cfg, MAP, first + call)
+        learned, _, _ = adjust(learned, batch, rates, STEPS, key, sequence.intrinsics, cfg, 1 - call / CALLS)
     box = None
     small = sequence.intrinsics.decimated(sequence.intrinsics.width // keyframes[0].depth.shape[1])
     for k in keyframes:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from maps import keyframe, pose, state, submap
-from mipsjax.closure import reconciled, solve
+from mipsjax.closure import solve, without_rejected
 from mipsjax.core import mapping
 from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, distance
@@ -76,7 +76,7 @@ def test_shared_frames_of_a_rejected_pair_are_dropped_where_they_were_not_tracke
     wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
     tracked = [given.records[0]._replace(submap=4 if number == 200 else COUNT - 1) for number in range(201)]
     solved, weights = solve(wrong._replace(records=tuple(tracked)), CFG)
-    kept = [[k.number for k in submap.keyframes] for submap in reconciled(solved, weights, CFG).submaps]
+    kept = [[k.number for k in submap.keyframes] for submap in without_rejected(solved, weights).submaps]
     before = [[k.number for k in submap.keyframes] for submap in given.submaps]
     before[4].append(200)
     assert kept == before

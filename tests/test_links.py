@@ -61,7 +61,7 @@ def test_doubt_grows_with_the_way_from_the_anchors():
     assert farther[0] == pytest.approx(np.hypot(cfg.loop.sigma_rotation, 5 * cfg.loop.drift_rotation))
 
 
-def test_disagreement_is_between_world_poses():
+def test_misfit_is_between_world_poses():
     T_cam = pose((0.0, 10.0, 0.0), (0.1, 0.0, 0.2))
     moved = pose(translation=(0.03, 0.0, 0.0))
     given = state(submap(keyframe(5, T_cam)), submap(keyframe(5), T_world_sub=moved @ T_cam))

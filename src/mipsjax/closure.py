@@ -10,12 +10,10 @@ from mipsjax.config import Config
 from mipsjax.host.factors import Factor
 from mipsjax.host.features import Features, similar
 from mipsjax.host.registration import relative_pose
-from mipsjax.links import Link, chain_distances, linked_pairs, links, misfit, sigmas, unlinked
+from mipsjax.links import Link, chain_distances, linked_pairs, links, misfit, unlinked
 from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
-
-DOUBT = 3.0  # standard deviations of the drift beyond which a shared frame is taken for a false one
 
 
 def prepare(state: SlamState, cfg: Config) -> None:
@@ -42,7 +40,7 @@ def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Conf
         seed = int(np.random.default_rng((cfg.seed, MATCH, keyframe.number, i)).integers(2**31))
         match = relative_pose(keyframe.features, database[i], state.camera, seed)
         if match.ok:
-            found = sight(state, place, keyframe, other.T_sub_cam @ match.T_other_current, cfg)
+            found = sight(state, place, keyframe, other.T_sub_cam @ match.T_other_current, cfg, measured=True)
             if found is not None:
                 return found
     return None
@@ -69,7 +67,7 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
         return state
     solved, weights = solve(state, cfg)
     moved = distance(_world(state), _world(solved))
-    made = [
+    made = tuple(
         Loop(
             frame=keyframe.number,
             first=active,
@@ -78,19 +76,21 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
             inliers=sighting.inliers,
             correction_m=moved[0],
             correction_rad=moved[1],
-            weight=0.0,
+            weight=weights.get(_pair(active, sighting.submap), 0.0),
         )
         for sighting, how in loops
-    ]
-    judged = [
-        loop._replace(weight=weights.get(_pair(loop.first, loop.second), 0.0))
-        for loop in (*state.loops, *made)
-    ]
-    return reconciled(solved, weights, cfg)._replace(loops=tuple(judged))
+    )
+    known = tuple(
+        loop._replace(weight=loop.weight and weights.get(_pair(loop.first, loop.second), loop.weight))
+        for loop in state.loops
+    )
+    return without_rejected(solved, weights)._replace(loops=(*known, *made))
 
 
 def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int], float]]:
     """Submap poses from all links and matched surfaces, and the weight of every linked pair. Fields stay as they are.
+
+    Where no solution is found all stays as it was, and no pair is judged.
 
     Only pairs far apart along the chain may be rejected: all others were seen from a pose that tracking had brought
     there. They are judged by their shared frames alone, since surfaces that look alike match as well in the wrong
@@ -105,30 +105,29 @@ def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int
     near = {p: [n < cfg.loop.apart for n in chain_distances(state, p)] for p, _ in places}
     frames = [pose_factor(pair, near[j][k], cfg) for pair, (j, k) in zip(pairs, places, strict=True)]
     judged = solve_graph(np.stack([submap.T_world_sub for submap in state.submaps]), frames)
+    if not judged.ok:
+        return state, {}
     kept = [(pair, frame) for pair, frame, w in zip(pairs, frames, judged.weights, strict=True) if w]
     factors: list[Factor] = [frame for _, frame in kept]
     factors += [f for pair, _ in kept if (f := plane_factor(pair, True, state.camera, cfg)) is not None]
     found = solve_graph(judged.T_world_sub, factors, robust=False)
-    for place, pose in enumerate(found.T_world_sub):
+    for place, pose in enumerate(found.T_world_sub if found.ok else judged.T_world_sub):
         state = state.with_submap(place, T_world_sub=pose)
     return state, dict(zip(places, judged.weights.tolist(), strict=True))
 
 
-def reconciled(state: SlamState, weights: dict[tuple[int, int], float], cfg: Config) -> SlamState:
-    """Without the shared frames that the pose graph has shown to be wrong.
+def without_rejected(state: SlamState, weights: dict[tuple[int, int], float]) -> SlamState:
+    """Without the frames shared by pairs that the pose graph has rejected, now or after it had kept them for a while.
 
-    These are all of a rejected pair, and those of others that disagree by more than the drift within their submaps
-    can explain. The frame stays where it was tracked. What made a submap begin stays in any case.
+    Such a frame stays a keyframe where it was tracked; one that was tracked in neither goes from both.
     """
     for (j, k), weight in weights.items():
-        if state.submaps[k].parent == j or state.submaps[j].parent == k:
+        if weight:
             continue
         for shared in links(state.submaps[j], state.submaps[k]):
-            turn, shift = sigmas(shared, cfg)
-            off = np.divide(misfit(state, j, k, shared), (shift, turn))
-            if not weight or np.any(off > DOUBT):
-                owner = state.records[shared.first.number].submap
-                state = unlinked(state, k if owner == j else j, shared.first.number)
+            owner = state.records[shared.first.number].submap
+            for place in {j, k} - {owner}:
+                state = unlinked(state, place, shared.first.number)
     return state
 
 

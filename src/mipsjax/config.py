@@ -228,12 +228,16 @@ class GuardConfig:
     lost: float = 0.6
     """Share of known pixels below which a frame is lost: never mapped. Frames of sequences that are tracked well have
     0.85 to 1; another room, wherever it fits best, commonly 0.4 to 0.7."""
-    residual: float = 0.02
-    """Metres; a frame with a larger residual is lost, or with more than 1.5 times the least of late, where that is
-    more. Frames that are tracked well have at most 18 mm, another room 20 to 30."""
     confirmed: float = 0.25
     """The same, of known pixels of which the map is certain: in space that was never observed everything looks like
-    surface. Frames of sequences that are tracked well have 0.5 to 1."""
+    surface. Frames that are tracked well have 0.5 to 1."""
+    residual: float = 0.024
+    """Metres; a frame with a larger residual is lost, if also `noise` times the least of late is less. Frames that are
+    tracked well have at most 18 mm, another room 20 to 30."""
+    residual_unsure: float = 0.018
+    """The same after a lost or skipped frame: what fits somewhere may be another place."""
+    noise: float = 1.5
+    """Factor on the least residual of late, below which a residual is the sensor's."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +274,7 @@ class VolumeConfig:
 
 @dataclass(frozen=True)
 class BackgroundConfig:
-    """Refinement of inactive submaps, one after the other."""
+    """Refinement of inactive submaps, in turn."""
 
     every_frames: int = 4
     """Frames between two refinements; 0 is none. The paper's second process refines all the time."""
@@ -361,7 +365,7 @@ class BlendConfig:
     """Metres, standard deviation of depth measured close by. A submap that measured a surface from nearer counts for
     more, by the inverse variance; one that did not measure it counts for nothing. Not in the paper."""
     noise_growth: float = 0.002
-    """Metres, the same at one metre; it grows with the square of the range. 0 is the paper's weight."""
+    """Metres, the same at one metre; it grows with the square of the range. 0: the range does not count, as in the paper."""
 
 
 @dataclass(frozen=True)

@@ -129,6 +129,8 @@ RANGES: dict[str, Range] = {
     "guard.lost": SHARE,
     "guard.confirmed": SHARE,
     "guard.residual": SWITCH,
+    "guard.residual_unsure": SWITCH,
+    "guard.noise": POSITIVE,
     "volume.far": POSITIVE,
     "volume.max_side": POSITIVE,
     "volume.overlap": SHARE,
@@ -178,6 +180,7 @@ NOT_BELOW = (
     ("field.hash_coarsest", "field.hash_finest"),
     ("field.truncation", "mesh.band"),
     ("guard.weak", "guard.lost"),
+    ("guard.residual", "guard.residual_unsure"),
     ("correspond.max_gradient", "correspond.min_gradient"),
 )
 """Pairs whose first field must not be below the second."""

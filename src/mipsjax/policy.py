@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from math import inf, log
+from math import log
 from typing import NamedTuple
 
 from mipsjax.config import Config
@@ -33,7 +33,7 @@ class FrameStats(NamedTuple):
     residual: float
     """Metres."""
     least_residual: float
-    """Of late; 0 if none is known."""
+    """Of late; 0 for the first tracked frame."""
     unsure: bool
     """The frame before was lost or skipped."""
     since_keyframe: int
@@ -56,9 +56,6 @@ class Decision(NamedTuple):
     map_steps: int
     pose_rate: float
     """Share of the pose learning rate in local bundle adjustment."""
-
-
-NOISE = 1.5  # times the least residual of late: no frame of that sensor is worse
 
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
@@ -110,12 +107,12 @@ def converged(residual: float, cfg: Config) -> float:
 def _status(stats: FrameStats, cfg: Config) -> Status:
     guard = cfg.guard
     unknown = stats.known < guard.lost or stats.confirmed < guard.confirmed
-    limit = max(guard.residual, NOISE * stats.least_residual)
-    if stats.unsure and limit < inf:  # what fits there may be another place: it must fit as well as usual
-        limit = min(limit, converged(stats.least_residual, cfg))
-    if not stats.finite or unknown or stats.residual > limit:
+    # What fits somewhere after a loss may be another place
+    limit = max(guard.residual_unsure if stats.unsure else guard.residual, guard.noise * stats.least_residual)
+    misfit = stats.residual > limit and stats.least_residual > 0
+    if not stats.finite or unknown or misfit:
         return Status.LOST
-    return Status.WEAK if stats.known < cfg.guard.weak else Status.OK
+    return Status.WEAK if stats.known < guard.weak else Status.OK
 
 
 def _is_keyframe(stats: FrameStats, cfg: Config) -> bool:

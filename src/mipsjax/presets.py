@@ -40,7 +40,7 @@ PAPER = Config(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
     ),
-    guard=GuardConfig(weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf")),
+    guard=GuardConfig(weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf"), residual_unsure=float("inf")),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, pose_rate=1.0),

@@ -38,12 +38,13 @@ def reconstruct(state: SlamState, cfg: Config, voxel_m: float | None = None) -> 
     """
     mesh = cfg.mesh
     voxel_m = mesh.voxel if voxel_m is None else voxel_m
-    blended = Blend(state, cfg)
+    margin_m = max(mesh.margin, MARGIN_VOXELS * voxel_m)
+    blended = Blend(state, cfg, margin_m)
     return extract(
         lambda points: blended(points, lambda b: (b.psi, b.entropy), colored=False),
         observed_points(state, cfg),
         voxel_m,
-        margin_m=max(mesh.margin, MARGIN_VOXELS * voxel_m),
+        margin_m=margin_m,
         color=lambda points: blended(points, lambda b: b.color, colored=True),
         band_m=mesh.band,
         max_entropy=mesh.max_entropy * np.log(cfg.field.classes) if cfg.field.classification else None,
@@ -66,10 +67,14 @@ def _measured(state: SlamState, keyframe: Keyframe, cfg: Config) -> Float64[np.n
 
 
 class Blend:
-    """The blend of all submaps as a function of points of the world, metres."""
+    """The blend of all submaps as a function of points of the world, metres.
 
-    def __init__(self, state: SlamState, cfg: Config) -> None:
+    A submap counts up to `margin_m` at least, and up to the truncation, from what it has measured.
+    """
+
+    def __init__(self, state: SlamState, cfg: Config, margin_m: float = 0.0) -> None:
         self._state, self._cfg = state, cfg
+        self._reach = max(margin_m, cfg.field.truncation)
         self._observed = [self._of_submap(submap) for submap in state.submaps]
 
     def _of_submap(self, submap: Submap) -> Observed:
@@ -78,7 +83,7 @@ class Blend:
             np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
             for p, k in zip(points, submap.keyframes, strict=True)
         ]
-        return observe(np.concatenate(points), np.concatenate(ranges))
+        return observe(np.concatenate(points), np.concatenate(ranges), self._reach)
 
     def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:
         """What is wanted of the blend, in padded chunks of one size: one compilation."""

@@ -35,6 +35,7 @@ from mipsjax.state import (
     distance,
     inverse,
     last_pose,
+    pose_of,
     rigid,
     thumbnail,
 )
@@ -248,7 +249,8 @@ def _last_trusted(state: SlamState) -> Record:
 def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState:
     """With motion and residual after a trusted frame."""
     newest, older = state.records[-1], _last_trusted(before)
-    motion = Motion(inverse(last_pose(before)) @ last_pose(state), newest.timestamp - older.timestamp)
+    T_older_newer = inverse(pose_of(state, before.records[-1])) @ pose_of(state, newest)
+    motion = Motion(T_older_newer, newest.timestamp - older.timestamp)
     over = max(residual - before.residual, 0.0)
     floor = min(residual, before.residual + RESIDUAL_RISE * over) if before.residual else residual
     return state._replace(motion=motion, residual=floor)

@@ -142,7 +142,7 @@ class SlamState(NamedTuple):
     """Weak or lost frames in a row, up to now."""
     loops: tuple[Loop, ...] = ()
     motion: Motion | None = None
-    """None where one of the last two frames was not trusted."""
+    """None before there are two trusted frames, and where a lost camera was found elsewhere."""
     refinement: Refinement | None = None
     """Under way."""
     residual: float = 0.0

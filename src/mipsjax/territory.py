@@ -65,8 +65,13 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
     return state, sightings
 
 
-def sight(state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Config) -> Sighting | None:
-    """The frame in a submap, from a guess of its pose; None where it does not fit what the submap knows."""
+def sight(
+    state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Config, measured: bool = False
+) -> Sighting | None:
+    """The frame in a submap, from a guess of its pose; None where it does not fit what the submap knows.
+
+    Unless the guess was `measured`, as by image features, the surfaces must hold the frame in every direction.
+    """
     small = mapping_camera(state.camera, cfg)
     found = jax.device_get(
         tracking.register(
@@ -78,7 +83,9 @@ def sight(state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Co
         )
     )
     loop = cfg.loop
-    fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers and found.held >= loop.held
+    fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers
+    if not measured:
+        fits = fits and found.held >= loop.held
     if not (np.isfinite(found.T_sub_cam).all() and fits):
         return None
     return Sighting(place, rigid(found.T_sub_cam), float(found.inliers))

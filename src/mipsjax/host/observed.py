@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-CELL = 0.1
-"""Metres, edge of a cell; with its neighbours it reaches as far as the truncation at least."""
 BITS = 20
 """Of a cell's coordinate along one axis: 50 km either way."""
 
@@ -17,38 +15,37 @@ BITS = 20
 class Observed(NamedTuple):
     """Cells with measured surface in them or in a neighbour."""
 
+    cell_m: float
+    """Edge of a cell; together with its neighbours it reaches this far at least."""
     cells: Int64[np.ndarray, " C"]
     """Packed coordinates, ascending."""
     range_m: Float32[np.ndarray, " C"]
     """Nearest range from which it was measured."""
 
 
-def observe(points: Float[np.ndarray, "N 3"], range_m: Float[np.ndarray, " N"]) -> Observed:
+def observe(points: Float[np.ndarray, "N 3"], range_m: Float[np.ndarray, " N"], cell_m: float) -> Observed:
     """From measured points and the ranges they were measured from, metres."""
     near = np.argsort(range_m, kind="stable")
-    cells, first = np.unique(_cell(points[near]), axis=0, return_index=True)
-    range_m = range_m[near][first]
+    cells = np.floor(points[near] / cell_m).astype(np.int64)
+    _, first = np.unique(_packed(cells), return_index=True)
+    cells, range_m = cells[first], range_m[near][first]
     around = np.array(list(product((-1, 0, 1), repeat=3)))
     packed = _packed((cells[:, None] + around[None]).reshape(-1, 3))
     ranges = np.repeat(range_m, len(around))
     near = np.argsort(ranges, kind="stable")
     keys, first = np.unique(packed[near], return_index=True)
-    return Observed(keys, ranges[near][first].astype(np.float32))
+    return Observed(cell_m, keys, ranges[near][first].astype(np.float32))
 
 
 def range_at(observed: Observed, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
     """Metres; infinite where nothing was measured."""
     out = np.full(len(points), np.inf, np.float32)
     if len(observed.cells):
-        key = _packed(_cell(points))
+        key = _packed(np.floor(points / observed.cell_m).astype(np.int64))
         place = np.minimum(np.searchsorted(observed.cells, key), len(observed.cells) - 1)
         found = observed.cells[place] == key
         out[found] = observed.range_m[place[found]]
     return out
-
-
-def _cell(points: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N 3"]:
-    return np.floor(points / CELL).astype(np.int64)
 
 
 def _packed(cells: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
