@@ -365,7 +365,7 @@ class BlendConfig:
     """Metres, standard deviation of depth measured close by. A submap that measured a surface from nearer counts for
     more, by the inverse variance; one that did not measure it counts for nothing. Not in the paper."""
     noise_growth: float = 0.002
-    """Metres, the same at one metre; it grows with the square of the range. 0: the range does not count, as in the paper."""
+    """Metres, the same at one metre; it grows with the square of the range. 0: it does not count, as in the paper."""
 
 
 @dataclass(frozen=True)
