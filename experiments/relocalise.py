@@ -5,7 +5,7 @@
 `covered`: 300 frames of a synthetic scene, 5 s without depth or light, then frames 150 to 299 again, as if the camera
 had been carried back. `cut`: 300 frames, 100 frames of another room, then frames 200 to 299 again. Errors are
 distances to the true position after rigid alignment of the first 300 frames alone. Wrong is a frame that was trusted,
-in a submap that a chain or a kept loop connects with the first, more than 10 cm off. Writes `relocalise.csv` and a plot
+in a submap that shared frames connect with the first, more than 10 cm off. Writes `relocalise.csv` and a plot
 of each run.
 """
 
@@ -24,9 +24,9 @@ from mipsjax.core.volume import moved
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.host.metrics import align_rigid
-from mipsjax.links import chain_distances
+from mipsjax.links import joined
 from mipsjax.policy import Status
-from mipsjax.state import SlamState, trajectory
+from mipsjax.state import trajectory
 
 FIRST = 300
 COVERED = 150
@@ -50,19 +50,6 @@ def cut(sequence: Sequence) -> Iterator[tuple[Frame, int]]:
 
 
 CASES = {"covered": covered, "cut": cut}
-
-
-def connected(state: SlamState) -> set[int]:
-    """Submaps that hang together with the first, by chain or kept loops."""
-    reached, grown = {0}, True
-    while grown:
-        more = {
-            i for place in reached for i, n in enumerate(chain_distances(state, place)) if n < float("inf")
-        }
-        more |= {loop.second for loop in state.loops if loop.weight and loop.first in reached}
-        more |= {loop.first for loop in state.loops if loop.weight and loop.second in reached}
-        grown, reached = more != reached, more
-    return reached
 
 
 def main() -> None:
@@ -92,7 +79,7 @@ def trial(name: str, case: str, seed: int) -> dict[str, Any]:
     error = np.linalg.norm(moved(align_rigid(poses[:FIRST], truth[:FIRST]), poses) - truth, axis=1)
     seen = np.array(places) >= 0
     error[~seen] = np.nan
-    home = connected(state)
+    home = joined(state, 0)
     trusted = np.array([r.status in (Status.OK, Status.WEAK) for r in state.records]) & seen
     at_home = trusted & np.array([r.submap in home for r in state.records])
     back = len(places) - (COVERED if case == "covered" else FIRST - 200)

@@ -50,6 +50,14 @@ def test_the_chain_is_made_of_submaps_begun_from_each_other():
     assert links.chain_distances(given, 5) == [INF] * 5 + [0]
 
 
+def test_submaps_are_joined_by_shared_frames_also_across_others():
+    given = state(
+        submap(keyframe(0)), submap(keyframe(5)), submap(keyframe(0), keyframe(7)), submap(keyframe(7))
+    )
+    assert links.joined(given, 0) == links.joined(given, 3) == {0, 2, 3}
+    assert links.joined(given, 1) == {1}
+
+
 def test_doubt_grows_with_the_way_from_the_anchors():
     cfg = Config()
     at_anchor = links.Link(keyframe(0), keyframe(0))

@@ -46,6 +46,11 @@ def linked_pairs(state: SlamState) -> list[tuple[int, int]]:
     return [(j, k) for j in range(count) for k in range(j + 1, count) if numbers[j] & numbers[k]]
 
 
+def joined(state: SlamState, start: int) -> set[int]:
+    """Submaps that shared frames connect with one, itself among them: how these lie is known."""
+    return set(_steps(len(state.submaps), linked_pairs(state), start))
+
+
 def chain_distances(state: SlamState, start: int) -> list[float]:
     """Steps along the chain from one submap to each, each step from a submap to one that was begun from it or back.
 
@@ -54,16 +59,23 @@ def chain_distances(state: SlamState, start: int) -> list[float]:
     steps = [
         (place, submap.parent) for place, submap in enumerate(state.submaps) if submap.parent is not None
     ]
-    away = [float("inf")] * len(state.submaps)
-    away[start], queue = 0, deque([start])
+    reached = _steps(len(state.submaps), steps, start)
+    return [reached.get(place, float("inf")) for place in range(len(state.submaps))]
+
+
+def _steps(count: int, edges: list[tuple[int, int]], start: int) -> dict[int, int]:
+    """Least number of edges from one of `count` places to each that can be reached."""
+    beside: list[list[int]] = [[] for _ in range(count)]
+    for a, b in edges:
+        beside[a].append(b)
+        beside[b].append(a)
+    away, queue = {start: 0}, deque([start])
     while queue:
         here = queue.popleft()
-        for step in steps:
-            if here in step:
-                there = step[1] if step[0] == here else step[0]
-                if away[there] == float("inf"):
-                    away[there] = away[here] + 1
-                    queue.append(there)
+        for there in beside[here]:
+            if there not in away:
+                away[there] = away[here] + 1
+                queue.append(there)
     return away
 
 

@@ -12,6 +12,7 @@ from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
+from mipsjax.links import joined
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, inverse, rigid
 
@@ -43,6 +44,7 @@ def begin(
 def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
     """After a new keyframe of the active submap: its box grows, the frame is offered to the submaps that see it.
 
+    Only to those of which it is known how they lie: where the camera had been lost, boxes mean nothing.
     Returns the sightings that became linked keyframes.
     """
     keyframe = state.submap.keyframes[-1]
@@ -52,11 +54,11 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
         box=volume.grow(state.submap.box, volume.moved(keyframe.T_sub_cam, p_cam), mask, cfg.volume),
     )
     T_world_cam = state.submap.T_world_sub @ keyframe.T_sub_cam
-    sightings = []
+    sightings, near = [], joined(state, state.active)
     for place, submap in enumerate(state.submaps):
         guess = inverse(submap.T_world_sub) @ T_world_cam
         inside = volume.contained(submap.box, volume.moved(guess, p_cam), mask)
-        if place == state.active or inside < cfg.loop.overlap:
+        if place == state.active or place not in near or inside < cfg.loop.overlap:
             continue
         found = sight(state, place, keyframe, guess, cfg)
         if found is not None:
