@@ -9,11 +9,13 @@ from mipsjax.bundle import MATCH
 from mipsjax.config import Config
 from mipsjax.host.factors import Factor
 from mipsjax.host.features import Features, similar
-from mipsjax.host.registration import relative_pose
+from mipsjax.host.registration import Match, relative_pose
 from mipsjax.links import Link, chain_distances, linked_pairs, links, misfit, unlinked
 from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, link, sight
+
+DEVIATIONS = 3.0  # standard deviations of a pose from features by which the field may correct it
 
 
 def prepare(state: SlamState, cfg: Config) -> None:
@@ -40,10 +42,21 @@ def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Conf
         seed = int(np.random.default_rng((cfg.seed, MATCH, keyframe.number, i)).integers(2**31))
         match = relative_pose(keyframe.features, database[i], state.camera, seed)
         if match.ok:
-            found = sight(state, place, keyframe, other.T_sub_cam @ match.T_other_current, cfg, measured=True)
-            if found is not None:
+            guess = other.T_sub_cam @ match.T_other_current
+            found = sight(state, place, keyframe, guess, cfg, measured=True)
+            if found is not None and _near(guess, found.T_sub_cam, match, cfg):
                 return found
     return None
+
+
+def _near(guess: Pose, found: Pose, match: Match, cfg: Config) -> bool:
+    """The field puts the frame where the features do: things of one kind in two rooms match, the rooms do not."""
+    metres, radians = distance(guess, found)
+    loop = cfg.loop
+    return (
+        metres <= loop.sigma + DEVIATIONS * match.deviation_m
+        and radians <= loop.sigma_rotation + DEVIATIONS * match.deviation_rad
+    )
 
 
 def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: Config) -> SlamState:
