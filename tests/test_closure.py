@@ -90,6 +90,19 @@ def test_neighbours_along_the_chain_are_never_rejected(ring):
     assert weights[1, 3] == 1
 
 
+def test_a_false_loop_is_no_neighbour_of_a_neighbour(ring):
+    """Its frame is in the next submap too, which is near the one that it was wrongly found in."""
+    given, truth = ring
+    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    also = (*wrong.submaps[3].keyframes, keyframe(200, STEP @ DRIFT))
+    wrong = wrong.with_submap(3, keyframes=also)
+    solved, weights = solve(wrong, CFG, frozenset({200}))
+    assert weights[1, 4] == 0 and weights[1, 3] == 0 and weights[0, COUNT - 1] == 1
+    assert off(solved, truth) < 0.1 * off(given, truth)
+    trusted, _ = solve(wrong, CFG)
+    assert off(trusted, truth) > off(given, truth), "this is what would come of it"
+
+
 def test_a_submap_that_hangs_on_nothing_stays(ring):
     given, _ = ring
     alone = submap(keyframe(300), T_world_sub=pose(translation=(9.0, 0.0, 0.0)), learned=given.submap.learned)

@@ -78,7 +78,8 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
     loops: list[tuple[Sighting, How]] = [pair for pair in found if pair[0].submap in new]
     if not loops and all(_agrees(state, sighting.submap, cfg) for sighting, _ in found):
         return state
-    solved, weights = solve(state, cfg)
+    doubtful = {loop.frame for loop in state.loops} | ({keyframe.number} if loops else set())
+    solved, weights = solve(state, cfg, frozenset(doubtful))
     moved = distance(_world(state), _world(solved))
     made = tuple(
         Loop(
@@ -100,14 +101,17 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
     return without_rejected(solved, weights)._replace(loops=(*known, *made))
 
 
-def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int], float]]:
+def solve(
+    state: SlamState, cfg: Config, doubtful: frozenset[int] = frozenset()
+) -> tuple[SlamState, dict[tuple[int, int], float]]:
     """Submap poses from all links and matched surfaces, and the weight of every linked pair. Fields stay as they are.
 
     Where no solution is found all stays as it was, and no pair is judged.
 
-    Only pairs far apart along the chain may be rejected: all others were seen from a pose that tracking had brought
-    there. They are judged by their shared frames alone, since surfaces that look alike match as well in the wrong
-    place; the surfaces of those that are kept then make them exact.
+    Only pairs far apart along the chain may be rejected, and those that share a `doubtful` frame, one that made a
+    loop: all others were seen from a pose that tracking had brought there. They are judged by their shared frames
+    alone, since surfaces that look alike match as well in the wrong place; the surfaces of those that are kept then
+    make them exact.
     """
     from mipsjax.host.posegraph import (
         solve as solve_graph,
@@ -116,7 +120,11 @@ def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int
     places = linked_pairs(state)
     pairs = [pair_of(state.submaps, place) for place in places]
     near = {p: [n < cfg.loop.apart for n in chain_distances(state, p)] for p, _ in places}
-    frames = [pose_factor(pair, near[j][k], cfg) for pair, (j, k) in zip(pairs, places, strict=True)]
+    sure = [
+        near[j][k] and (pair.chained or pair.link.first.number not in doubtful)
+        for pair, (j, k) in zip(pairs, places, strict=True)
+    ]
+    frames = [pose_factor(pair, trusted, cfg) for pair, trusted in zip(pairs, sure, strict=True)]
     judged = solve_graph(np.stack([submap.T_world_sub for submap in state.submaps]), frames)
     if not judged.ok:
         return state, {}
