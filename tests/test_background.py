@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mipsjax.background import turn
-from mipsjax.config import BackgroundConfig, Config
+from mipsjax.config import Config
+from mipsjax.config_submaps import BackgroundConfig
 
 CFG = replace(Config(), background=BackgroundConfig(every_frames=4, steps=10))
 

@@ -11,7 +11,8 @@ import pytest
 
 from compilations import compilations
 from mipsjax import schedule, slam
-from mipsjax.config import Config, InputConfig, LoopConfig, VolumeConfig
+from mipsjax.config import Config, InputConfig
+from mipsjax.config_submaps import LoopConfig, VolumeConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.final import finish

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from mipsjax.config import (
-    BackgroundConfig,
-    BlendConfig,
     Config,
     FieldConfig,
     GuardConfig,
     KeyframeConfig,
-    LoopConfig,
     LossConfig,
     MapConfig,
     MeshConfig,
@@ -17,9 +14,14 @@ from mipsjax.config import (
     SampleConfig,
     SearchConfig,
     TrackConfig,
-    VolumeConfig,
 )
+from mipsjax.config_submaps import BackgroundConfig, BlendConfig, LoopConfig, VolumeConfig
 from mipsjax.errors import ConfigError
+
+UNGUARDED = GuardConfig(
+    weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf"), residual_unsure=float("inf")
+)
+"""By what a pose explains alone: the paper has no guard, and the few steps of `tiny` leave all uncertain."""
 
 PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
@@ -40,7 +42,7 @@ PAPER = Config(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
     ),
-    guard=GuardConfig(weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf"), residual_unsure=float("inf")),
+    guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, pose_rate=1.0),
@@ -66,9 +68,7 @@ TINY = Config(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
         go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
     ),
-    guard=GuardConfig(
-        weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf")
-    ),  # so few steps leave every point uncertain
+    guard=UNGUARDED,
     mesh=MeshConfig(voxel=0.05),
 )
 PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

@@ -12,10 +12,11 @@ import trimesh
 from jaxtyping import Float, Float32, Float64, Int
 
 from mipsjax.bundle import unprojected
-from mipsjax.config import BlendConfig, Config
+from mipsjax.config import Config
+from mipsjax.config_submaps import BlendConfig
 from mipsjax.core import blend, volume
 from mipsjax.host.meshing import extract
-from mipsjax.host.observed import Observed, observe, range_at
+from mipsjax.host.observed import Observed, observe, trust_at
 from mipsjax.state import Keyframe, SlamState, Submap, inverse
 
 CHUNK_POINTS = 65536
@@ -83,7 +84,8 @@ class Blend:
             np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
             for p, k in zip(points, submap.keyframes, strict=True)
         ]
-        return observe(np.concatenate(points), np.concatenate(ranges), self._reach)
+        trust = _trust(np.concatenate(ranges), self._cfg.blend)
+        return observe(np.concatenate(points), trust, self._reach)
 
     def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:
         """What is wanted of the blend, in padded chunks of one size: one compilation."""
@@ -94,15 +96,15 @@ class Blend:
         parts = [jax.device_get(wanted(self._chunk(chunk, colored))) for chunk in chunks]
         return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
 
-    def nearest(self, points: Points) -> Int[np.ndarray, " N"]:
-        """The submap that measured near each point from nearest, and has the largest trust; -1 where none did."""
-        ranges = np.stack(
+    def leading(self, points: Points) -> Int[np.ndarray, " N"]:
+        """The submap that is trusted most at each point; -1 where none is."""
+        trust = np.stack(
             [
-                range_at(observed, volume.moved(inverse(submap.T_world_sub), points))
+                trust_at(observed, volume.moved(inverse(submap.T_world_sub), points))
                 for submap, observed in zip(self._state.submaps, self._observed, strict=True)
             ]
         )
-        return np.where(np.isfinite(ranges.min(0)), ranges.argmin(0), -1)
+        return np.where(trust.max(0) > 0, trust.argmax(0), -1)
 
     def _chunk(self, points: Float64[np.ndarray, "C 3"], colored: bool) -> blend.Blended:
         """Over the submaps that have measured near a point, which need not be in their boxes.
@@ -116,15 +118,14 @@ class Blend:
         for submap, observed in zip(self._state.submaps, self._observed, strict=True):
             T_sub_world = inverse(submap.T_world_sub)
             there = volume.moved(T_sub_world, points)
-            trust = _trust(range_at(observed, there), cfg.blend)
+            trust = trust_at(observed, there)
             if (trust > 0).any():
                 T = jnp.asarray(T_sub_world @ middle, jnp.float32)
                 total = blend.add(total, submap.learned.field, T, jnp.asarray(trust), near, cfg, colored)
         return total
 
 
-def _trust(range_m: Float32[np.ndarray, " N"], cfg: BlendConfig) -> Float32[np.ndarray, " N"]:
-    """Inverse variance of depth measured from a range, 1 close by, 0 where nothing was measured."""
-    measured = np.isfinite(range_m)
-    noise = cfg.noise_growth * np.where(measured, range_m, 0) ** 2 / cfg.noise_floor
-    return np.where(measured, 1 / (1 + noise**2), 0).astype(np.float32)
+def _trust(range_m: Float64[np.ndarray, " N"], cfg: BlendConfig) -> Float64[np.ndarray, " N"]:
+    """Inverse variance of depth measured from a range, 1 close by."""
+    noise = cfg.noise_growth * range_m**2 / cfg.noise_floor
+    return 1 / (1 + noise**2)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mipsjax.config import VolumeConfig
+from mipsjax.config_submaps import VolumeConfig
 from mipsjax.core import volume
 from mipsjax.core.volume import Box, boxes_overlap, contained, grow, inside, moved, seen
 

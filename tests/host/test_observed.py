@@ -1,11 +1,11 @@
-"""Where a submap measured, and from how near."""
+"""Where a submap measured, and how well."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from mipsjax.host.observed import observe, range_at
+from mipsjax.host.observed import observe, trust_at
 
 CELL = 0.1
 RNG = np.random.default_rng(0)
@@ -13,30 +13,40 @@ RNG = np.random.default_rng(0)
 
 def test_every_measured_point_and_its_surroundings_are_observed():
     points = RNG.uniform(-3, 3, (200, 3))
-    observed = observe(points, np.full(200, 2.0), CELL)
-    around = points + RNG.uniform(-CELL, CELL, points.shape)
-    np.testing.assert_array_equal(range_at(observed, around), np.full(200, 2.0, np.float32))
+    observed = observe(points, np.ones(200), CELL)
+    around = points + RNG.uniform(-0.99 * CELL, 0.99 * CELL, points.shape)
+    assert (trust_at(observed, around) > 0).all()
 
 
 def test_far_from_all_points_nothing_is():
     points = RNG.uniform(-1, 1, (50, 3))
     observed = observe(points, np.ones(50), CELL)
     away = np.array([[1 + 2.1 * CELL, 0, 0], [0, -9, 0], [300.0, 0, 0]])
-    assert np.isinf(range_at(observed, away)).all()
+    assert (trust_at(observed, away) == 0).all()
 
 
-def test_the_nearest_range_counts():
-    """Also that of a neighbouring cell, by the definition in double loops."""
-    points, ranges = RNG.uniform(0, 1, (300, 3)), RNG.uniform(0.5, 5, 300)
-    observed = observe(points, ranges, CELL)
+def test_trust_by_its_definition():
+    """The best of each cell: along an axis half of it within the cell, falling to 0 one cell away; in double loops."""
+    points, trust = RNG.uniform(0, 1, (300, 3)), RNG.uniform(0, 1, 300)
+    observed = observe(points, trust, CELL)
     asked = RNG.uniform(-0.3, 1.3, (200, 3))
-    cells, mine = np.floor(points / CELL), np.floor(asked / CELL)
-    for point_cell, found in zip(mine, range_at(observed, asked), strict=True):
-        near = np.abs(cells - point_cell).max(1) <= 1
-        wanted = ranges[near].min() if near.any() else np.inf
-        assert found == pytest.approx(wanted)
+    cells = np.floor(points / CELL).astype(int)
+    best = {tuple(cell): trust[(cells == cell).all(1)].max() for cell in cells}
+
+    def spread(cells_off: np.ndarray) -> float:
+        return float(np.prod(np.clip(1.5 - np.abs(cells_off), 0, 1) / 2))
+
+    for point, found in zip(asked, trust_at(observed, asked), strict=True):
+        wanted = sum(t * spread(point / CELL - np.array(cell) - 0.5) for cell, t in best.items())
+        assert found == pytest.approx(wanted, abs=1e-5)
+
+
+def test_trust_has_no_steps():
+    observed = observe(RNG.uniform(0, 1, (100, 3)), RNG.uniform(0, 1, 100), CELL)
+    along = np.linspace([-0.3, 0.2, 0.1], [1.3, 0.9, 0.8], 20_000)
+    assert np.abs(np.diff(trust_at(observed, along))).max() < 1e-3
 
 
 def test_without_points_nothing_is_observed():
     observed = observe(np.zeros((0, 3)), np.zeros(0), CELL)
-    assert np.isinf(range_at(observed, np.zeros((4, 3)))).all()
+    assert (trust_at(observed, np.zeros((4, 3))) == 0).all()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from mipsjax.config import VolumeConfig
+from mipsjax.config_submaps import VolumeConfig
 from mipsjax.core.camera import Intrinsics
 
 ROWS, COLUMNS = 12, 16
