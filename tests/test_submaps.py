@@ -6,11 +6,13 @@ from dataclasses import replace
 from itertools import pairwise
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from compilations import compilations
 from mipsjax import schedule, slam
+from mipsjax.bundle import rested
 from mipsjax.config import Config, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
 from mipsjax.data.sequence import Frame
@@ -107,6 +109,19 @@ def test_submaps_share_frames_that_measure_how_they_lie(states):
 def test_the_last_frame_is_always_in_the_active_submap(states):
     for state in states:
         assert state.records[-1].submap == state.active
+
+
+def test_what_a_submap_learned_by_rests_where_the_camera_is_not(states):
+    """Half the bytes of Adam's averages, and the same averages but for rounding."""
+    for state in states:
+        for place, submap in enumerate(state.submaps):
+            kinds = {leaf.dtype for leaf in jax.tree.leaves(submap.learned.optimizer) if leaf.ndim}
+            assert kinds == {np.dtype(np.float32 if place == state.active else jnp.bfloat16)}
+    awake = states[-1].submap.learned
+    for full, half in zip(*map(jax.tree.leaves, (awake.optimizer, rested(awake).optimizer)), strict=True):
+        np.testing.assert_allclose(np.asarray(half, np.float32), full, rtol=2**-8)
+    for before, after in zip(*map(jax.tree.leaves, (awake.field, rested(awake).field)), strict=True):
+        assert after is before
 
 
 def test_boxes_keep_to_their_limit_and_anchors_to_the_origin(states):

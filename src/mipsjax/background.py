@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax
 
-from mipsjax.bundle import BACKGROUND, choose, random_key, refine, refine_together
+from mipsjax.bundle import BACKGROUND, choose, random_key, refine, refine_together, rested
 from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.schedule import Executor, Job
@@ -42,7 +42,7 @@ def refine_inactive(state: SlamState, cfg: Config, executor: Executor) -> SlamSt
 def refined(
     submaps: tuple[Submap, ...], places: tuple[int, ...], number: int, camera: Intrinsics, cfg: Config
 ) -> list[Submap]:
-    """Local bundle adjustment of submaps, each on its anchor and random keyframes."""
+    """Local bundle adjustment of submaps, each on its anchor and random keyframes; they go on resting."""
     work, others = cfg.background, cfg.map.frames - 1
     chosen = [
         choose(submap, others, (cfg.seed, BACKGROUND, number, place))
@@ -51,8 +51,10 @@ def refined(
     keys = [jax.random.fold_in(random_key(cfg, BACKGROUND, number), place) for place in places]
     if len(submaps) == 1:
         (submap,), (some,), (key,) = submaps, chosen, keys
-        return [refine(submap, some, work.pose_rate, work.steps, key, camera, cfg)[0]]
-    return refine_together(list(submaps), chosen, work.pose_rate, work.steps, keys, camera, cfg)
+        after = [refine(submap, some, work.pose_rate, work.steps, key, camera, cfg)[0]]
+    else:
+        after = refine_together(list(submaps), chosen, work.pose_rate, work.steps, keys, camera, cfg)
+    return [submap._replace(learned=rested(submap.learned)) for submap in after]
 
 
 def taken_over(state: SlamState, executor: Executor) -> SlamState:

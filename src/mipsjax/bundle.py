@@ -67,6 +67,24 @@ def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
     return picked + [0] * (1 + others - len(picked))
 
 
+def rested(learned: mapping.Learned) -> mapping.Learned:
+    """With Adam's averages in half the bytes, as a submap is kept while the camera is elsewhere."""
+    return _cast(learned, np.float32, jnp.bfloat16)
+
+
+def _awake(learned: mapping.Learned) -> mapping.Learned:
+    return _cast(learned, jnp.bfloat16, np.float32)
+
+
+def _cast(learned: mapping.Learned, old: type, new: type) -> mapping.Learned:
+    """On the host, where nothing is compiled for it."""
+
+    def cast(leaf):
+        return np.asarray(leaf).astype(new) if leaf.dtype == old else leaf
+
+    return learned._replace(optimizer=jax.tree.map(cast, learned.optimizer))
+
+
 def refine(
     submap: Submap,
     chosen: list[int],
@@ -95,7 +113,8 @@ def refine_together(
     parts = [_batch(submap, places, share) for submap, places in zip(submaps, chosen, strict=True)]
     frames = [_frames(batch, rates) for batch, rates in parts]
     stack = jax.tree.map(
-        lambda *leaves: jnp.stack(leaves), *zip([s.learned for s in submaps], frames, keys, strict=True)
+        lambda *leaves: jnp.stack(leaves),
+        *zip([_awake(s.learned) for s in submaps], frames, keys, strict=True),
     )
     learned, views, keys_ = stack
     at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
@@ -122,10 +141,11 @@ def adjust(
 ) -> tuple[mapping.Learned, list[Pose], bool]:
     """`mapping.refine` on a batch: shares of the pose rate for each keyframe (0: fixed), of the networks' rate.
 
-    Returns what was learned, the poses and whether all stayed finite; if not, nothing has changed.
+    Returns what was learned, the poses and whether all stayed finite; if not, nothing has changed. What was learned
+    may be `rested` before, and is not after.
     """
     learned, poses, info = mapping.refine(
-        learned,
+        _awake(learned),
         _frames(batch, rates),
         jnp.int32(steps),
         key,

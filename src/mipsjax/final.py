@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mipsjax.background import taken_over
-from mipsjax.bundle import FINISH, MAP, adjust, random_key
+from mipsjax.bundle import FINISH, MAP, adjust, random_key, rested
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.schedule import INLINE, Executor
@@ -43,7 +43,8 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
         learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, key, state.camera, cfg, fall)
         for i, pose in zip(chosen, poses, strict=True):
             keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
-    return state.with_submap(place, learned=learned, keyframes=tuple(keyframes))
+    kept = learned if place == state.active else rested(learned)
+    return state.with_submap(place, learned=kept, keyframes=tuple(keyframes))
 
 
 def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:

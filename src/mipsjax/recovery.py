@@ -11,7 +11,7 @@ from mipsjax.closure import recognise
 from mipsjax.config import Config
 from mipsjax.policy import Status
 from mipsjax.state import Keyframe, Pose, SlamState, distance, world_pose
-from mipsjax.territory import begin
+from mipsjax.territory import activated, begin
 
 
 class Place(NamedTuple):
@@ -31,7 +31,7 @@ def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | Non
         return None
     known = state.submaps[found.submap].keyframes
     nearest = min(range(len(known)), key=lambda i: sum(distance(known[i].T_sub_cam, found.T_sub_cam)))
-    return Place(state._replace(active=found.submap), nearest, found.T_sub_cam)
+    return Place(activated(state, found.submap), nearest, found.T_sub_cam)
 
 
 def lost_in_a_row(state: SlamState) -> int:
@@ -44,5 +44,5 @@ def start_anew(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place:
     """A submap that hangs on nothing, placed where the camera was seen last until a loop joins it to the others."""
     last_seen = world_pose(state, state.records[-1])
     submap, _ = begin(keyframe, [], last_seen, cfg.map.submap_steps, state.camera, cfg)
-    state = state._replace(submaps=(*state.submaps, submap), active=len(state.submaps))
-    return Place(state, 0, np.eye(4))
+    state = state._replace(submaps=(*state.submaps, submap))
+    return Place(activated(state, len(state.submaps) - 1), 0, np.eye(4))

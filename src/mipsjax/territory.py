@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine
+from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine, rested
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
@@ -147,7 +147,13 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
 def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
     """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
     last = state.records[-1]._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4))
-    return state._replace(active=place, records=(*state.records[:-1], last))
+    return activated(state, place)._replace(records=(*state.records[:-1], last))
+
+
+def activated(state: SlamState, place: int) -> SlamState:
+    """The camera is in the submap at `place` from here on; the one before rests."""
+    state = state.with_submap(state.active, learned=rested(state.submap.learned))
+    return state._replace(active=place)
 
 
 def _seen(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> tuple[np.ndarray, np.ndarray]:

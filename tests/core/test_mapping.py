@@ -70,6 +70,21 @@ def test_the_gradient_does_not_depend_on_the_chunks(fresh, corner_frames, monkey
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
 
 
+def test_samples_around_the_surface_do_not_depend_on_the_chunks(fresh, corner_frames, monkeypatch):
+    cfg = replace(CFG, sample=replace(CFG.sample, surface=3))
+    frames = jax.tree.map(jnp.asarray, corner_frames)
+
+    def depth():
+        drawn = mapping.draw(fresh.field, frames, KEY, CAMERA, cfg).samples.depth
+        return np.asarray(drawn).reshape(-1, drawn.shape[-1])
+
+    whole = depth()
+    monkeypatch.setattr(mapping, "CHUNK_SAMPLES", 300)
+    same = np.isclose(depth(), whole, rtol=0, atol=1e-6).all(1)
+    # Of two samples with about the same distance, rounding may choose the other
+    assert same.mean() > 0.98
+
+
 def test_poses_are_corrected_and_the_anchor_stays(corner_map, jolted):
     _, poses, info = refine(corner_map, jolted, 40)
     assert bool(info.ok)

@@ -196,17 +196,20 @@ def draw(field: nf.Field, frames: Frames, key: PRNGKeyArray, camera: Intrinsics,
     chunks = _chunks(len(frame), depth.shape[1] + cfg.sample.surface)
 
     def finish(chunk):
-        key, frame, pixels, depth = chunk
+        frame, pixels, depth, jitter = chunk
 
         def distance(depth):
             points = _points(frames.T_sub_cam, frame, pixels, depth)
             return nf.tsdf(field, points, cfg.field).psi.reshape(depth.shape)
 
-        depth = sampling.second_phase(key, depth, distance, cfg.sample)
+        depth = sampling.second_phase(jitter, depth, distance, cfg.sample)
         return Batch(frame, pixels, sampling.label(depth, pixels.depth, pixels.slope, cfg.field.truncation))
 
-    rays = jax.tree.map(lambda a: a.reshape(chunks, -1, *a.shape[1:]), (frame, pixels, depth))
-    return jax.lax.map(finish, (jax.random.split(k_surface, chunks), *rays))
+    jitter = jax.random.uniform(k_surface, (len(frame), cfg.sample.surface))
+    rays = (frame, pixels, depth, jitter)
+    return jax.lax.map(
+        finish, jax.tree.map(lambda a: a.reshape(chunks, len(frame) // chunks, *a.shape[1:]), rays)
+    )
 
 
 def _chunks(rays: int, samples: int) -> int:

@@ -31,7 +31,14 @@ def stratified(
     key: PRNGKeyArray, lo: Float[Array, " P"], hi: Float[Array, " P"], count: int
 ) -> Float[Array, "P S"]:
     """One uniform draw in each of `count` equal parts of [lo, hi]."""
-    jitter = jax.random.uniform(key, (lo.shape[0], count))
+    return spread(jax.random.uniform(key, (lo.shape[0], count)), lo, hi)
+
+
+def spread(
+    jitter: Float[Array, "P S"], lo: Float[Array, " P"], hi: Float[Array, " P"]
+) -> Float[Array, "P S"]:
+    """A place in each of S equal parts of [lo, hi], at a share 0..1 of its length."""
+    count = jitter.shape[1]
     return lo[:, None] + (hi - lo)[:, None] * (jnp.arange(count)[None] + jitter) / count
 
 
@@ -46,18 +53,21 @@ def first_phase(
 
 
 def second_phase(
-    key: PRNGKeyArray,
+    jitter: Float[Array, "P X"],
     depth: Float[Array, "P S"],
     distance: Callable[[Float[Array, "P S"]], Float[Array, "P S"]],
     cfg: SampleConfig,
-) -> Float[Array, "P S2"]:
-    """Adds depths around the first-phase sample whose predicted distance is the smallest."""
+) -> Float[Array, "P S+X"]:
+    """Adds depths around the first-phase sample whose predicted distance is the smallest.
+
+    `jitter` are uniform draws in 0..1, one for each of the `surface` samples.
+    """
     if cfg.surface == 0:
         return depth
     best = jnp.argmin(jnp.abs(distance(depth)), -1)
     center = jnp.take_along_axis(depth, best[:, None], -1)[:, 0]
     lo = jnp.maximum(center - cfg.surface_spread, NEAR)
-    extra = stratified(key, lo, center + cfg.surface_spread, cfg.surface)
+    extra = spread(jitter, lo, center + cfg.surface_spread)
     return jnp.concatenate([depth, extra], -1)
 
 
