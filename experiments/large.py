@@ -15,6 +15,9 @@ run, `large-memory.csv`, a row each new submap, and for each run a picture of th
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
+import resource
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -98,27 +101,39 @@ def plan(done: Run, T: Pose, path: str) -> None:
 
 
 class Memory:
-    """Resident memory, without what other processes could share, each time the number of submaps has grown."""
+    """Each time the number of submaps has grown: resident memory without what other processes could share, after the
+    allocator gave back what it had kept (glibc keeps tens of megabytes more or less), and what fills it."""
 
     def __init__(self, about: dict[str, Any]) -> None:
         self.rows: list[dict[str, Any]] = []
         self._about = about
+        self._trim = ctypes.CDLL("libc.so.6").malloc_trim
 
     def __call__(self, state: SlamState) -> None:
-        if not self.rows or self.rows[-1]["submaps"] != len(state.submaps):
-            with open("/proc/self/statm") as file:
-                _, resident, shared, *_ = (int(pages) * 4096 / 2**20 for pages in file.read().split())
-            kept = {k.number: k for submap in state.submaps for k in submap.keyframes}
-            pixels = sum(keyframe_bytes(k) for k in kept.values())
-            self.rows.append(
-                self._about
-                | {
-                    "frame": len(state.records),
-                    "submaps": len(state.submaps),
-                    "resident_mb": resident - shared,
-                }
-                | {"keyframes_mb": pixels / 2**20}
-            )
+        if self.rows and self.rows[-1]["submaps"] == len(state.submaps):
+            return
+        gc.collect()
+        self._trim(0)
+        with open("/proc/self/statm") as file:
+            _, resident, shared, *_ = (int(pages) * resource.getpagesize() for pages in file.read().split())
+        kept = {k.number: k for submap in state.submaps for k in submap.keyframes}.values()
+        pixels = sum(k.depth.nbytes + k.color.nbytes for k in kept)
+        sizes = {
+            "resident": resident - shared,
+            "pixels": pixels,
+            "features": sum(map(keyframe_bytes, kept)) - pixels,
+            "thumbnails": sum(r.depth.nbytes for r in state.records if r.depth is not None),
+        }
+        counts = {"frame": len(state.records), "submaps": len(state.submaps), "keyframes": len(kept)}
+        self.rows.append(self._about | counts | {f"{k}_mb": v / 1e6 for k, v in sizes.items()})
+
+    def growth_mb(self) -> float:
+        """Slope over the number of submaps, from two on, without the pixels of keyframes."""
+        several = [row for row in self.rows if row["submaps"] > 1]
+        if len(several) < 2:
+            return float("nan")
+        rest = [row["resident_mb"] - row["pixels_mb"] for row in several]
+        return float(np.polyfit([row["submaps"] for row in several], rest, 1)[0])
 
 
 def main() -> None:
@@ -147,7 +162,7 @@ def main() -> None:
         mesh = reconstruct(done.state, cfg)
         leading = Blend(done.state, cfg).leading(mesh.vertices)
         mesh.apply_transform(T)
-        row = {"switch": switch} | done.row
+        row = {"switch": switch} | done.row | {"growth_mb_per_submap": watch.growth_mb()}
         if not options.no_surface:
             row |= surface_row(done, mesh, name)
             row |= {} if name == "living" else analytic_row(done, mesh, leading)

@@ -1,12 +1,19 @@
-"""Which inactive submap is refined when."""
+"""Which inactive submap is refined when, and several at once."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from mipsjax.background import turn
+import jax
+import numpy as np
+
+import maps
+from mipsjax.background import refined, turn
 from mipsjax.config import Config
 from mipsjax.config_submaps import BackgroundConfig
+from mipsjax.core import mapping
+from mipsjax.presets import PRESETS
+from mipsjax.state import Submap
 
 CFG = replace(Config(), background=BackgroundConfig(every_frames=4, steps=10))
 
@@ -28,3 +35,27 @@ def test_nothing_to_refine():
     off = replace(CFG, background=BackgroundConfig(every_frames=0))
     assert turn(4, 0, 3, off) == ()
     assert turn(4, 0, 3, replace(CFG, background=BackgroundConfig(steps=0))) == ()
+
+
+def test_several_at_once_become_what_they_become_one_by_one():
+    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5, pose_rate=1.0))
+    submaps = tuple(tilted(seed) for seed in (1, 2))
+    together = refined(submaps, (3, 5), 40, maps.CAMERA, cfg)
+    alone = [
+        refined((s,), (place,), 40, maps.CAMERA, cfg)[0] for s, place in zip(submaps, (3, 5), strict=True)
+    ]
+    for before, one, other in zip(submaps, together, alone, strict=True):
+        for a, b in zip(jax.tree.leaves(one.learned), jax.tree.leaves(other.learned), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_allclose(np.asarray(a, np.float32), np.asarray(b, np.float32), atol=1e-6)
+        poses = [np.stack([k.T_sub_cam for k in submap.keyframes]) for submap in (before, one, other)]
+        np.testing.assert_allclose(poses[1], poses[2], atol=1e-6)
+        np.testing.assert_array_equal(poses[1][0], np.eye(4))
+        assert np.abs(poses[1][1:] - poses[0][1:]).max() > 1e-4, "nothing moved"
+
+
+def tilted(seed: int) -> Submap:
+    """A submap that knows nothing, with views of a wall that is not parallel to the image."""
+    slope = np.linspace(0, seed, maps.DEPTH.shape[1], dtype=np.float32)
+    views = [maps.keyframe(i, maps.pose((0, i, 0)))._replace(depth=maps.DEPTH + slope) for i in range(3)]
+    return maps.submap(*views, learned=mapping.create(jax.random.key(seed), PRESETS["tiny"]))

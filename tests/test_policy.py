@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mipsjax.config import Config, GuardConfig, KeyframeConfig, MapConfig, SearchConfig, TrackConfig
-from mipsjax.policy import NEW, STAY, FrameStats, Status, decide, governor, widening
+from mipsjax.policy import NEW, STAY, FrameStats, Status, converged, decide, governor, widening
 
 CFG = Config(
     map=MapConfig(steps=10, steps_slow=4, motion=0.1),
@@ -53,6 +53,13 @@ def test_a_frame_that_fits_only_where_nothing_was_observed_is_lost():
     limit = CFG.guard.confirmed
     assert decide(PLAIN._replace(confirmed=limit), CFG).status is Status.OK
     assert decide(PLAIN._replace(confirmed=limit - 0.01), CFG).status is Status.LOST
+
+
+@pytest.mark.parametrize(("least", "limit"), [(0.0, 0.01), (0.005, 0.01), (0.01, 0.015), (0.5, 0.02)])
+def test_a_search_begins_above_the_noise_of_the_sensor(least, limit):
+    """Never below the limit of its own, and at twice that at most."""
+    search = replace(CFG.track.ro, residual=0.01, residual_margin=1.5)
+    assert converged(least, replace(CFG, track=replace(CFG.track, ro=search))) == pytest.approx(limit)
 
 
 def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():

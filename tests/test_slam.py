@@ -152,6 +152,39 @@ def test_finish_aligns_every_trusted_frame_to_the_map(finished, frames):
     assert same_map(after, state)
 
 
+def test_the_least_residual_falls_at_once_and_rises_slowly(finished, frames):
+    last = finished.records[-1].info.residual_after
+    for before in (2 * last, 0.5 * last):
+        state = slam.step(finished._replace(residual=before), frames[-1], CFG)
+        ends_at = state.records[-1].info.residual_after
+        assert state.records[-1].status is Status.OK
+        if before > ends_at:
+            assert state.residual == pytest.approx(ends_at)
+        else:
+            assert before < state.residual < before + 0.1 * (ends_at - before)
+
+
+def test_the_motion_is_that_between_the_last_trusted_frames(finished, frames):
+    poses = trajectory(finished)
+    assert finished.motion is not None
+    np.testing.assert_allclose(finished.motion.T_older_newer, np.linalg.inv(poses[-2]) @ poses[-1], atol=1e-9)
+    blind = slam.step(finished, frames[0]._replace(depth=None, problem="gone"), CFG)
+    assert blind.motion is finished.motion, "nothing was learned about it"
+
+
+@pytest.mark.parametrize(
+    ("frame", "problem"),
+    [
+        ({}, ""),
+        ({"color": None}, "no image"),
+        ({"depth": None, "problem": "torn file"}, "torn file"),
+        ({"depth": np.zeros((48, 64), np.float32)}, "depth in 0.0 % of the pixels only"),
+    ],
+)
+def test_which_frame_can_begin_a_map(frames, frame, problem):
+    assert slam.anchor_problem(frames[0]._replace(**frame)) == problem
+
+
 def test_finish_without_steps_changes_nothing(finished):
     cfg = replace(CFG, map=replace(CFG.map, final_steps=0))
     go = replace(cfg.track.go, final_steps=0)

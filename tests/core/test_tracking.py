@@ -63,6 +63,13 @@ def track(field, frame, *candidates):
     return jax.device_get(tracking.track(field, depth, color, starts, WIDENING, KEY, CAMERA, CFG))
 
 
+def see_points(depth: np.ndarray) -> np.ndarray:
+    """What each pixel shows, H W 3, in the world."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+    return ray * depth[..., None] @ TRUTH[:3, :3].T + TRUTH[:3, 3]
+
+
 def test_points_are_those_of_the_depth_image(points, frame):
     inside = np.asarray(transform(jnp.asarray(TRUTH, jnp.float32), points.p_cam))
     assert np.abs(inside - WALLS).min(1).max() < 1e-5
@@ -178,6 +185,33 @@ def test_tracking_is_deterministic(corner_map, frame):
     one, other = (track(corner_map.field, frame, start, start) for _ in range(2))
     for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_what_is_known_and_what_is_only_not_contradicted(corner_map, points):
+    """Space that was never observed has distances near zero, so that any surface would fit there."""
+    T = jnp.asarray(TRUTH, jnp.float32)
+    here = tracking.measure_fit(corner_map.field, T, points, "whole", CFG)
+    assert here.known > 0.95 and 0.5 < here.confirmed <= here.known
+    elsewhere = T.at[:3, 3].add(jnp.array([30.0, 40.0, 50.0]))
+    there = tracking.measure_fit(corner_map.field, elsewhere, points, "whole", CFG)
+    assert there.confirmed < CFG.guard.confirmed < here.confirmed
+
+
+def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, frame):
+    depth, _ = frame
+    back = np.abs(see_points(depth)[..., 2] - WALLS[2]) < 1e-3
+    assert 0.1 < back.mean() < 0.9
+
+    def register(depth):
+        guess = jnp.asarray(TRUTH @ NEAR, jnp.float32)
+        return jax.device_get(tracking.register(corner_map.field, depth, guess, CAMERA, CFG))
+
+    corner, wall = register(depth), register(np.where(back, depth, np.float32(0)))
+    assert corner.overlap > 0.5 and corner.inliers > 0.95 and wall.inliers > 0.95
+    metres, degrees = apart(TRUTH, corner.T_sub_cam)
+    assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
+    # Along a wall the frame slides freely, in a corner it does not
+    assert corner.held > 10 * CFG.loop.held and wall.held < 0.2 * corner.held
 
 
 def test_the_robust_cost():
