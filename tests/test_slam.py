@@ -10,7 +10,7 @@ import pytest
 
 from compilations import compilations
 from mipsjax import slam
-from mipsjax.config import InputConfig
+from mipsjax.config import Config, InputConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
@@ -32,10 +32,10 @@ def frames(sequence) -> list[Frame]:
     return [sequence[i] for i in range(FRAMES)]
 
 
-def run(frames: list[Frame], camera) -> SlamState:
-    state = slam.start(frames[0], camera, CFG)
+def run(frames: list[Frame], camera, cfg: Config = CFG) -> SlamState:
+    state = slam.start(frames[0], camera, cfg)
     for frame in frames[1:]:
-        state = slam.step(state, frame, CFG)
+        state = slam.step(state, frame, cfg)
     return state
 
 
@@ -92,6 +92,13 @@ def test_two_runs_give_the_same_bits_and_the_second_compiles_nothing(frames, seq
 
 def following(frame: Frame) -> Frame:
     return frame._replace(number=FRAMES, timestamp=frame.timestamp + 1 / 30)
+
+
+def test_another_seed_compiles_nothing_and_draws_otherwise(frames, sequence, finished):
+    with compilations() as compiled:
+        other = run(frames, sequence.intrinsics, replace(CFG, seed=CFG.seed + 1))
+    assert not compiled
+    assert not np.array_equal(trajectory(other), trajectory(finished))
 
 
 @pytest.mark.parametrize("how", ["missing", "zero"])

@@ -6,6 +6,7 @@ Every number of the method is a field here. The `paper` preset holds the numbers
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -287,4 +288,6 @@ class Config:
     correspond: CorrespondConfig = CorrespondConfig()
     blend: BlendConfig = BlendConfig()
     mesh: MeshConfig = MeshConfig()
-    seed: int = 0
+    seed: int = dataclasses.field(default=0, compare=False)
+    """Of all random draws. Configurations that differ in it alone are equal, so that what was compiled for one serves
+    the other: compiled code is given keys."""
