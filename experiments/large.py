@@ -7,9 +7,10 @@
 of a new submap (SI), no bundle adjustment at a revisit (SR). ATE RMSE after rigid alignment, over all frames. The
 mesh is moved by that same alignment. Accuracy is the mean distance of its vertices to the analytic scene; the sampled
 one and completeness by 1,000,000 points on each mesh. The reference is culled to what the sensor measured from within
-5 m in every 10th frame; so is the mesh for the sampled accuracy, but not for completeness, since what lies 2 cm behind
-the surface counts as unseen. Seams are measured where the scene is analytic (`seams.py`). Writes `large.csv`, a row a
-run, `large-memory.csv`, a row each new submap, and for each run a picture of the trajectory from above and of the mesh.
+5 m in every 10th frame. So is the mesh for the sampled accuracy, which drops what lies more than 2 cm behind the true
+surface and flatters it; for completeness the mesh is whole. Seams are measured where the scene is analytic
+(`seams.py`). Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and for each run a picture
+of the trajectory from above and of the mesh.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ def main() -> None:
         memory += watch.rows
         T = align_rigid(trajectory(done.state)[:, :3, 3], done.sequence.T_world_cam[:, :3, 3])
         mesh = reconstruct(done.state, cfg)
-        leading = Blend(done.state, cfg).leading(mesh.vertices)
+        leading = Blend(done.state, cfg).leading(mesh.vertices)  # in the frame of the map
         mesh.apply_transform(T)
         row = {"switch": switch} | done.row | {"growth_mb_per_submap": watch.growth_mb()}
         if not options.no_surface:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -34,17 +33,17 @@ class Errors(NamedTuple):
     """Of the nearest surface."""
 
 
+@jax.jit
+def _distance_and_gradient(scene: Scene, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return scene.distance(points), jax.grad(lambda p: scene.distance(p).sum())(points)
+
+
 def errors(scene: Scene, points: Float[np.ndarray, "N 3"]) -> Errors:
     """Distances of points to the scene, and which way they lie."""
-
-    @jax.jit
-    def both(p):
-        return scene.distance(p), jax.grad(lambda p: scene.distance(p).sum())(p)
-
     count = len(points)
-    padded = np.zeros((-(-count // CHUNK) * CHUNK, 3), np.float32)
+    padded = np.zeros((max(1, -(-count // CHUNK)) * CHUNK, 3), np.float32)
     padded[:count] = points
-    parts = [jax.device_get(both(jnp.asarray(part))) for part in padded.reshape(-1, CHUNK, 3)]
+    parts = [jax.device_get(_distance_and_gradient(scene, part)) for part in padded.reshape(-1, CHUNK, 3)]
     distance, normal = (np.concatenate(column)[:count] for column in zip(*parts, strict=True))
     return Errors(distance, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))
 
@@ -61,17 +60,15 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
         if len(members) < 2 * FEWEST or not _flat(foot[members], off.normal[members]):
             continue
         places, counts = np.unique(submap[members], return_counts=True)
-        places = places[(counts >= FEWEST) & (places >= 0)]
-        if len(places) > 1:
-            sides = [members[submap[members] == place] for place in places]
-        elif len(places) == 1:
+        two = places[np.argsort(counts, kind="stable")[-2:]]
+        sides = [members[submap[members] == place] for place in two]
+        if len(places) == 1 and places[0] >= 0:
             along = vertices[members] @ rng.standard_normal(3)
-            cut = np.quantile(along, rng.uniform(0.3, 0.7))
-            sides = [members[along < cut], members[along >= cut]]
-        else:
-            continue
-        medians = [np.median(off.signed[side]) for side in sides]
-        steps["seam" if len(places) > 1 else "control"].append(100 * float(max(medians) - min(medians)))
+            order = members[np.argsort(along)]
+            place = int(rng.integers(FEWEST, len(members) - FEWEST + 1))
+            steps["control"].append(_step(order[:place], order[place:], off))
+        elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
+            steps["seam"].append(_step(*sides, off))
     return {
         f"{name}_{key}": value
         for name, sizes in steps.items()
@@ -84,6 +81,11 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
             "over_1_cm": float(np.mean(np.greater(sizes, 1))),
         }.items()
     }
+
+
+def _step(one: Int[np.ndarray, " A"], other: Int[np.ndarray, " B"], off: Errors) -> float:
+    """Centimetres between the median errors of two sets of vertices."""
+    return 100 * abs(float(np.median(off.signed[one]) - np.median(off.signed[other])))
 
 
 def _cells(vertices: Float[np.ndarray, "N 3"]) -> list[Int[np.ndarray, " M"]]:

@@ -136,3 +136,11 @@ def test_importing_the_package_loads_nothing_heavy():
     code = "import sys, mipsjax; print(*{'gtsam', 'cv2', 'trimesh', 'skimage', 'viser'} & set(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not out.stdout.split()
+
+
+def test_compiled_code_does_not_know_the_seed():
+    """Configurations that differ in it are equal, so that the first one compiled would serve the other."""
+    for module, tree in SOURCES.items():
+        if part_of(module) == "core":
+            read = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+            assert "seed" not in read, f"core takes keys, {module} reads a seed"

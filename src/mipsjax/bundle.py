@@ -72,7 +72,8 @@ def rested(learned: mapping.Learned) -> mapping.Learned:
     return _cast(learned, np.float32, jnp.bfloat16)
 
 
-def _awake(learned: mapping.Learned) -> mapping.Learned:
+def awake(learned: mapping.Learned) -> mapping.Learned:
+    """With these in single precision again; one that does not rest is given back as it is."""
     return _cast(learned, jnp.bfloat16, np.float32)
 
 
@@ -114,7 +115,7 @@ def refine_together(
     frames = [_frames(batch, rates) for batch, rates in parts]
     stack = jax.tree.map(
         lambda *leaves: jnp.stack(leaves),
-        *zip([_awake(s.learned) for s in submaps], frames, keys, strict=True),
+        *zip([awake(s.learned) for s in submaps], frames, keys, strict=True),
     )
     learned, views, keys_ = stack
     at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
@@ -145,7 +146,7 @@ def adjust(
     may be `rested` before, and is not after.
     """
     learned, poses, info = mapping.refine(
-        _awake(learned),
+        awake(learned),
         _frames(batch, rates),
         jnp.int32(steps),
         key,

@@ -70,7 +70,8 @@ def _measured(state: SlamState, keyframe: Keyframe, cfg: Config) -> Float64[np.n
 class Blend:
     """The blend of all submaps as a function of points of the world, metres.
 
-    A submap counts up to `margin_m` at least, and up to the truncation, from what it has measured.
+    A submap counts as far as its trust reaches (`host/observed.py`), which is `margin_m` and the truncation at least
+    from what it has measured, fading on the way.
     """
 
     def __init__(self, state: SlamState, cfg: Config, margin_m: float = 0.0) -> None:

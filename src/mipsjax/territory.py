@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine, rested
+from mipsjax.bundle import INIT, MAP, adjust, awake, choose, mapping_camera, random_key, refine, rested
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
@@ -152,8 +152,10 @@ def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
 
 def activated(state: SlamState, place: int) -> SlamState:
     """The camera is in the submap at `place` from here on; the one before rests."""
+    if place == state.active:
+        return state
     state = state.with_submap(state.active, learned=rested(state.submap.learned))
-    return state._replace(active=place)
+    return state.with_submap(place, learned=awake(state.submaps[place].learned))._replace(active=place)
 
 
 def _seen(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> tuple[np.ndarray, np.ndarray]:

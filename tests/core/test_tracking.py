@@ -188,7 +188,7 @@ def test_tracking_is_deterministic(corner_map, frame):
 
 
 def test_what_is_known_and_what_is_only_not_contradicted(corner_map, points):
-    """Space that was never observed has distances near zero, so that any surface would fit there."""
+    """Far away the field may say anything, but is certain of nothing."""
     T = jnp.asarray(TRUTH, jnp.float32)
     here = tracking.measure_fit(corner_map.field, T, points, "whole", CFG)
     assert here.known > 0.95 and 0.5 < here.confirmed <= here.known
@@ -199,7 +199,9 @@ def test_what_is_known_and_what_is_only_not_contradicted(corner_map, points):
 
 def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, frame):
     depth, _ = frame
-    back = np.abs(see_points(depth)[..., 2] - WALLS[2]) < 1e-3
+    seen = see_points(depth)
+    # Its middle: where walls meet, the field is round
+    back = (np.abs(seen[..., 2] - WALLS[2]) < 1e-3) & (np.abs(seen - WALLS)[..., :2].min(-1) > 0.3)
     assert 0.1 < back.mean() < 0.9
 
     def register(depth):
@@ -210,7 +212,7 @@ def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, fr
     assert corner.overlap > 0.5 and corner.inliers > 0.95 and wall.inliers > 0.95
     metres, degrees = apart(TRUTH, corner.T_sub_cam)
     assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
-    # Along a wall the frame slides freely, in a corner it does not
+    # Along a wall the frame slides freely but for the waves of a field with cells of 5 cm, in a corner it does not
     assert corner.held > 10 * CFG.loop.held and wall.held < 0.2 * corner.held
 
 

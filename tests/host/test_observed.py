@@ -26,19 +26,31 @@ def test_far_from_all_points_nothing_is():
 
 
 def test_trust_by_its_definition():
-    """The best of each cell: along an axis half of it within the cell, falling to 0 one cell away; in double loops."""
+    """In double loops: along an axis a cell gives half of its trust within itself, falling to 0 one cell away."""
     points, trust = RNG.uniform(0, 1, (300, 3)), RNG.uniform(0, 1, 300)
     observed = observe(points, trust, CELL)
     asked = RNG.uniform(-0.3, 1.3, (200, 3))
     cells = np.floor(points / CELL).astype(int)
     best = {tuple(cell): trust[(cells == cell).all(1)].max() for cell in cells}
 
-    def spread(cells_off: np.ndarray) -> float:
+    def weight(cells_off: np.ndarray) -> float:
         return float(np.prod(np.clip(1.5 - np.abs(cells_off), 0, 1) / 2))
 
     for point, found in zip(asked, trust_at(observed, asked), strict=True):
-        wanted = sum(t * spread(point / CELL - np.array(cell) - 0.5) for cell, t in best.items())
+        wanted = sum(t * weight(point / CELL - np.array(cell) - 0.5) for cell, t in best.items())
         assert found == pytest.approx(wanted, abs=1e-5)
+
+
+@pytest.mark.parametrize("height", [0.53, 0.5, 0.501])
+def test_trust_in_a_wall_is_that_of_its_points_and_fades_at_its_end(height):
+    """Up to a factor of two, by where the grid lies: in a cell, on a border between two, by noise in both."""
+    noise = RNG.normal(0, 0.004, 40_000)
+    wall = np.column_stack([RNG.uniform(0, 2, (40_000, 2)), height + noise])
+    observed = observe(wall, np.full(len(wall), 0.8), CELL)
+    inside = trust_at(observed, np.column_stack([RNG.uniform(0.3, 1.7, (100, 2)), np.full(100, height)]))
+    assert (inside >= 0.4 - 1e-6).all() and (inside <= 0.8 + 1e-6).all()
+    ends = trust_at(observed, np.array([[x, 1, height] for x in (1.85, 1.95, 2.05, 2.15)]))
+    assert (np.diff(ends) < 0).all() and ends[-1] == 0
 
 
 def test_trust_has_no_steps():

@@ -9,20 +9,23 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 BITS = 20
-"""Of a node's coordinate along one axis: 50 km either way."""
+"""Of a corner's coordinate along one axis: half a million cells either way."""
 CORNERS = np.array(list(product((0, 1), repeat=3)))
-"""Of a cell, in cells."""
+"""Offsets from a cell's coordinates to its eight corners."""
 
 
 class Observed(NamedTuple):
-    """Corners of cells with measured surface in them; all others have trust 0."""
+    """A regular grid of cells, of which some hold measured surface; what is known of them is kept at their corners."""
 
     cell_m: float
     """Edge of a cell."""
-    nodes: Int64[np.ndarray, " C"]
-    """Packed coordinates, ascending."""
+    corners: Int64[np.ndarray, " C"]
+    """Packed coordinates, ascending; those that touch no measured cell are left out."""
     trust: Float32[np.ndarray, " C"]
-    """0..1, the mean of the eight cells around a node."""
+    """0..1, the mean of the eight cells around each; one without measured surface has 0."""
+    lo: Float[np.ndarray, "3"]
+    """Metres, where the outermost corners' values have fallen to 0."""
+    hi: Float[np.ndarray, "3"]
 
 
 def observe(points: Float[np.ndarray, "N 3"], trust: Float[np.ndarray, " N"], cell_m: float) -> Observed:
@@ -30,25 +33,32 @@ def observe(points: Float[np.ndarray, "N 3"], trust: Float[np.ndarray, " N"], ce
     best = np.argsort(-trust, kind="stable")
     cells = np.floor(points[best] / cell_m).astype(np.int64)
     _, first = np.unique(_packed(cells), return_index=True)
-    corners = (cells[first][:, None] + CORNERS[None]).reshape(-1, 3)
-    nodes, place = np.unique(_packed(corners), return_inverse=True)
-    total = np.bincount(place, np.repeat(trust[best][first], len(CORNERS)), len(nodes))
-    return Observed(cell_m, nodes, (total / len(CORNERS)).astype(np.float32))
+    touched = (cells[first][:, None] + CORNERS[None]).reshape(-1, 3)
+    corners, place = np.unique(_packed(touched), return_inverse=True)
+    total = np.bincount(place.ravel(), np.repeat(trust[best][first], len(CORNERS)), len(corners))
+    lo, hi = (touched.min(0) - 1, touched.max(0) + 1) if len(touched) else np.zeros((2, 3))
+    mean = (total / len(CORNERS)).astype(np.float32)
+    return Observed(cell_m, corners, mean, cell_m * lo, cell_m * hi)
 
 
 def trust_at(observed: Observed, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
-    """Trilinear between the nodes, thus continuous: 0 from one cell beyond the measured ones on."""
+    """Trust at each point, 0..1, trilinear between the corners.
+
+    So it is continuous, and fades where measurements end: half of what it was at the border, 0 one cell beyond. A wall
+    that lies on a border of cells, in both layers, has up to twice what it has inside one layer.
+    """
     out = np.zeros(len(points), np.float32)
-    if not len(observed.nodes):
+    near = np.flatnonzero(((points > observed.lo) & (points < observed.hi)).all(1))
+    if not len(near):
         return out
-    scaled = points / observed.cell_m
+    scaled = points[near] / observed.cell_m
     cells = np.floor(scaled).astype(np.int64)
     share = (scaled - cells).astype(np.float32)
     for corner in CORNERS:
         key = _packed(cells + corner)
-        place = np.minimum(np.searchsorted(observed.nodes, key), len(observed.nodes) - 1)
+        place = np.minimum(np.searchsorted(observed.corners, key), len(observed.corners) - 1)
         weight = np.where(corner, share, 1 - share).prod(1)
-        out += np.where(observed.nodes[place] == key, weight * observed.trust[place], 0)
+        out[near] += np.where(observed.corners[place] == key, weight * observed.trust[place], 0)
     return out
 
 
