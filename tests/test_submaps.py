@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from compilations import compilations
-from mipsjax import schedule, slam
+from mipsjax import recovery, schedule, slam
 from mipsjax.bundle import rested
 from mipsjax.config import Config, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
@@ -22,8 +22,9 @@ from mipsjax.links import linked_pairs, links
 from mipsjax.policy import Status
 from mipsjax.presets import PRESETS
 from mipsjax.reconstruct import reconstruct
-from mipsjax.state import SlamState, distance, trajectory, world_pose
+from mipsjax.state import SlamState, Submap, distance, trajectory, world_pose
 from mipsjax.surfaces import pair_of, plane_factor
+from mipsjax.territory import Sighting
 
 CFG = replace(
     PRESETS["tiny"],
@@ -115,8 +116,7 @@ def test_what_a_submap_learned_by_rests_where_the_camera_is_not(states):
     """Half the bytes of Adam's averages, and the same averages but for rounding."""
     for state in states:
         for place, submap in enumerate(state.submaps):
-            kinds = {leaf.dtype for leaf in jax.tree.leaves(submap.learned.optimizer) if leaf.ndim}
-            assert kinds == {np.dtype(np.float32 if place == state.active else jnp.bfloat16)}
+            assert rests(submap) is (place != state.active)
     awake = states[-1].submap.learned
     for full, half in zip(*map(jax.tree.leaves, (awake.optimizer, rested(awake).optimizer)), strict=True):
         np.testing.assert_allclose(np.asarray(half, np.float32), full, rtol=2**-8)
@@ -200,3 +200,23 @@ def test_a_frame_of_nowhere_is_lost_or_never_trusted(states, frames):
     after = slam.step(states[-1], wall, CFG)
     assert after.records[-1].status is not Status.OK
     assert len(after.submaps) == len(states[-1].submaps)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_camera_found_again_goes_on_in_that_submap(states, monkeypatch, place):
+    state = states[-1]
+    pose = state.submaps[place].keyframes[1].T_sub_cam
+    monkeypatch.setattr(recovery, "recognise", lambda *_: Sighting(place, pose, 0.9))
+    found = recovery.find_again(state, state.submap.keyframes[-1], CFG)
+    assert found is not None
+    assert found.state.active == place and found.keyframe == 1
+    kept = [
+        after.learned is before.learned
+        for before, after in zip(state.submaps, found.state.submaps, strict=True)
+    ]
+    assert kept == [place == state.active] * 2
+    assert rests(found.state.submaps[1 - place]) and not rests(found.state.submap)
+
+
+def rests(submap: Submap) -> bool:
+    return any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(submap.learned))
