@@ -1,32 +1,48 @@
 """Poses where the camera enters a known submap again, with and without bundle adjustment before it.
 
-    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--seed 0]
+    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--seed 0] [--variants full ...]
 
-The first frames of a synthetic scene and the same backwards, so that submaps are left and entered again with the drift
-of the way between, and loop closure on and off. RPE over one frame (translation, cm). Writes `revisit.csv`, a row each
-variant with the RPE in the 10 frames from a revisit on and elsewhere, and a plot.
+The first frames of a synthetic scene and the same backwards, so that submaps are left and entered again with the
+drift of the way between. `full`: the frame with which a known submap takes over is registered in it, bundle
+adjustment follows (SR), and the pose graph is solved (LC); without SR, without LC, without both; `none`: without
+registration either, the pose in the known submap is what the world poses of the submaps say. RPE over one frame
+(translation, cm). Writes `revisit.csv`, a row each variant with the RPE in the 10 frames from a revisit on and
+elsewhere, and a plot.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 from common import OUT, changed, follow, show, use_compilation_cache, write_rows
+from mipsjax import territory
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.host.metrics import absolute_error
 from mipsjax.state import trajectory
 
 AROUND = 10  # frames after a revisit
+
+
+class Variant(NamedTuple):
+    revisit_steps: int
+    loop: bool
+    registered: bool = True
+
+
 VARIANTS = {
-    "with": (10, True),
-    "without": (0, True),
-    "with, no loop closure": (10, False),
-    "without, no loop closure": (0, False),
+    "full": Variant(10, True),
+    "no-sr": Variant(0, True),
+    "no-lc": Variant(10, False),
+    "no-sr-no-lc": Variant(0, False),
+    "none": Variant(0, False, registered=False),
 }
 
 
@@ -37,13 +53,18 @@ def main() -> None:
     parser.add_argument("--name", default="apartment+noise")
     parser.add_argument("--frames", type=int, default=450)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     options = parser.parse_args()
     use_compilation_cache()
-    figure, axes = plt.subplots(len(VARIANTS), 1, figsize=(9, 9), sharex=True, sharey=True)
+    count = len(options.variants)
+    figure, axes = plt.subplots(count, 1, figsize=(9, 2.2 * count), sharex=True, sharey=True, squeeze=False)
     rows = []
-    for (title, (steps, loop)), axis in zip(VARIANTS.items(), axes, strict=True):
-        cfg = changed(Config(seed=options.seed), "map", revisit_steps=steps)
-        rpe, active, ate = trial(options.name, options.frames, changed(cfg, "loop", enabled=loop))
+    for title, axis in zip(options.variants, axes[:, 0], strict=True):
+        variant = VARIANTS[title]
+        cfg = changed(Config(seed=options.seed), "map", revisit_steps=variant.revisit_steps)
+        cfg = changed(cfg, "loop", enabled=variant.loop)
+        with nullcontext() if variant.registered else unregistered():
+            rpe, active, ate = trial(options.name, options.frames, cfg)
         entered = [i for i, (a, b) in enumerate(pairwise(active)) if b < a]
         near = np.zeros(len(rpe), bool)
         for i in entered:
@@ -65,10 +86,26 @@ def main() -> None:
         axis.plot(rpe, linewidth=0.8)
         for i in entered:
             axis.axvline(i, color="red", linestyle="--", linewidth=0.8)
-        axis.set(ylabel="RPE, cm", title=f"bundle adjustment at the revisit: {title}")
-    axes[-1].set_xlabel("frame; red: a known submap is entered again")
+        axis.set(ylabel="RPE, cm", title=title)
+    axes[-1, 0].set_xlabel("frame; red: a known submap is entered again")
     figure.tight_layout()
     figure.savefig(OUT / "revisit.png", dpi=110)
+
+
+@contextmanager
+def unregistered() -> Iterator[None]:
+    """Frames are linked to other submaps at the pose that was guessed, as if they had not been registered there."""
+    original = territory.sight
+
+    def sight(state, place, keyframe, guess, cfg, measured=False):
+        found = original(state, place, keyframe, guess, cfg, measured)
+        return None if found is None else found._replace(T_sub_cam=guess)
+
+    territory.sight = sight
+    try:
+        yield
+    finally:
+        territory.sight = original
 
 
 def trial(name: str, count: int, cfg: Config) -> tuple[np.ndarray, list[int], float]:
