@@ -116,7 +116,7 @@ def stacks(devices: bool) -> None:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
     def together(vmap: bool) -> Callable[[], mapping.Learned]:
-        return lambda: mapping.refine_stack(*stack, steps, keys, camera, cfg, vmap)[0]
+        return lambda: mapping.refine_stack(*stack, steps, keys, camera, cfg, jnp.ones(SUBMAPS), vmap)[0]
 
     ways = {"one by one": one_by_one, "one call": together(False), "vmap": together(True)}
     single, rows = one_by_one(), []

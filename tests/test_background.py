@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pytest
 
 import maps
 from mipsjax.background import refined, turn
@@ -52,6 +53,17 @@ def test_several_at_once_become_what_they_become_one_by_one():
         np.testing.assert_allclose(poses[1], poses[2], atol=1e-6)
         np.testing.assert_array_equal(poses[1][0], np.eye(4))
         assert np.abs(poses[1][1:] - poses[0][1:]).max() > 1e-4, "nothing moved"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_at_no_rate_nothing_is_learned(count: int):
+    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5, rate=0.0))
+    submaps = tuple(tilted(seed) for seed in range(1, 1 + count))
+    for before, after in zip(
+        submaps, refined(submaps, tuple(range(count)), 40, maps.CAMERA, cfg), strict=True
+    ):
+        for a, b in zip(*(jax.tree.leaves(s.learned.field) for s in (before, after)), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def tilted(seed: int) -> Submap:

@@ -328,6 +328,7 @@ def test_lost_for_a_while_and_for_good(
     edit_depth(sequence, lost, lambda depth: rng.integers(5000, 30000, depth.shape).astype(np.uint16))
     result = program(sequence)
     assert result.code == code and result.metrics["status"] == status
+    assert (f"first in frame {lost[0]};" in result.stderr) == (status == "failed")
     assert result.metrics["status_counts"]["lost"] == len(lost)
     assert [event["index"] for event in result.events if event["event"] == "lost"] == list(lost)
 

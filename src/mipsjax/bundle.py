@@ -94,10 +94,11 @@ def refine(
     key: jax.Array,
     camera: Intrinsics,
     cfg: Config,
+    rate: float = 1.0,
 ) -> tuple[Submap, bool]:
     """`adjust` on some keyframes of a submap itself, all but the anchor at a share of the pose rate."""
     batch, rates = _batch(submap, chosen, share)
-    learned, poses, ok = adjust(submap.learned, batch, rates, steps, key, camera, cfg)
+    learned, poses, ok = adjust(submap.learned, batch, rates, steps, key, camera, cfg, rate)
     return _taken_over(submap, chosen, learned, poses), ok
 
 
@@ -109,6 +110,7 @@ def refine_together(
     keys: list[jax.Array],
     camera: Intrinsics,
     cfg: Config,
+    rate: float = 1.0,
 ) -> list[Submap]:
     """`refine` of several submaps in one call, spread over the devices."""
     parts = [_batch(submap, places, share) for submap, places in zip(submaps, chosen, strict=True)]
@@ -118,9 +120,10 @@ def refine_together(
         *zip([awake(s.learned) for s in submaps], frames, keys, strict=True),
     )
     learned, views, keys_ = stack
+    shares = jnp.full(len(submaps), rate, jnp.float32)
     at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
     learned, poses, _ = mapping.refine_stack(
-        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, at_once
+        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, shares, at_once
     )
     learned = jax.device_get(learned)  # and back to the first device, whatever refined it
     refined = []

@@ -140,6 +140,7 @@ RANGES: dict[str, Range] = {
     "background.every_frames": NOT_NEGATIVE,
     "background.steps": NOT_NEGATIVE,
     "background.together": COUNT,
+    "background.rate": SHARE,
     "background.pose_rate": SHARE,
     "loop.patience": COUNT,
     "loop.apart": COUNT,

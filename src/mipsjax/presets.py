@@ -45,7 +45,7 @@ PAPER = Config(
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
-    background=BackgroundConfig(every_frames=1, pose_rate=1.0),
+    background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
     blend=BlendConfig(noise_growth=0.0),
 )

@@ -157,7 +157,7 @@ def _exit_code(run: Run, folder: Path) -> int:
     if len(rows) - len(bad) < MIN_USABLE:
         raise InputError(f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}")
     if verdict(rows) == "failed":
-        lost = [row.index for row in rows if row.status is Status.LOST]
+        lost = [row.number for row in rows if row.status is Status.LOST]
         raise TrackingLostError(
             f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
             f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"

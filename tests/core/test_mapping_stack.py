@@ -19,6 +19,7 @@ CFG = PRESETS["tiny"]
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
 STEPS = jnp.int32(10)
 SUBMAPS = 4
+RATES = jnp.linspace(0.25, 1.0, SUBMAPS)
 
 
 def walls(seed: int) -> mapping.Frames:
@@ -39,12 +40,15 @@ def stacked():
 
 
 def together(stack, keys) -> mapping.Learned:
-    return mapping.refine_stack(*stack, STEPS, keys, CAMERA, CFG)[0]
+    return mapping.refine_stack(*stack, STEPS, keys, CAMERA, CFG, RATES)[0]
 
 
 def one_by_one(stack, keys) -> mapping.Learned:
     parts = [jax.tree.map(lambda leaf: leaf[i], stack) for i in range(SUBMAPS)]  # noqa: B023 (called here)
-    each = [mapping.refine(*part, STEPS, key, CAMERA, CFG)[0] for part, key in zip(parts, keys, strict=True)]
+    each = [
+        mapping.refine(*part, STEPS, key, CAMERA, CFG, rate)[0]
+        for part, key, rate in zip(parts, keys, RATES, strict=True)
+    ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
@@ -63,8 +67,8 @@ def test_a_stack_is_refined_as_one_by_one():
 def test_vmap_gives_the_same_but_for_rounding():
     """Which Adam enlarges where a gradient is about zero, and a step of ReLU where it changes side."""
     stack, keys = stacked()
-    vmapped = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG, vmap=True)[0]
-    single = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG)[0]
+    vmapped = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG, RATES, vmap=True)[0]
+    single = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG, RATES)[0]
     off = [
         np.abs(a - b).ravel()
         for a, b in zip(*map(jax.tree.leaves, jax.device_get((vmapped.field, single.field))), strict=True)

@@ -132,17 +132,18 @@ def refine_stack(
     keys: PRNGKeyArray,
     camera: Intrinsics,
     cfg: Config,
+    rates: Float[Array, "S"],
     vmap: bool = False,
 ) -> tuple[Learned, Float[Array, "S F 4 4"], MapInfo]:
-    """`refine` of S submaps in one call: learned, frames and keys have a leading axis of them.
+    """`refine` of S submaps in one call: learned, frames, keys and rates have a leading axis of them.
 
     That axis is spread over the devices, if S is a multiple of their number; each refines its part one after the
     other, to the same bits as `refine`, or with `vmap` all at once, rounded otherwise.
     """
 
     def one(part):
-        mine, views, key = part
-        return refine(mine, views, steps, key, camera, cfg)
+        mine, views, key, rate = part
+        return refine(mine, views, steps, key, camera, cfg, rate)
 
     several = jax.vmap(one) if vmap else partial(jax.lax.map, one)
     devices = jax.devices()
@@ -150,7 +151,7 @@ def refine_stack(
         mesh = jax.sharding.Mesh(np.array(devices), ("submap",))
         shares = jax.sharding.PartitionSpec("submap")
         several = jax.shard_map(several, mesh=mesh, in_specs=shares, out_specs=shares, check_vma=False)
-    return several((learned, frames, keys))
+    return several((learned, frames, keys, rates))
 
 
 def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:

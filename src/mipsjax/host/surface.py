@@ -108,7 +108,7 @@ def sample_surface(
     Raises:
         InputError: the mesh has no surface.
     """
-    corners = np.asarray(mesh.triangles, np.float64)
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # mesh.triangles would be kept
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cumulative = np.cumsum(np.linalg.norm(cross, axis=1))
     if len(cumulative) == 0 or not np.isfinite(cumulative[-1]) or cumulative[-1] <= 0:

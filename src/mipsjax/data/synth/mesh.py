@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Array, Float, Float32, Float64, Int
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int
 from skimage.measure import marching_cubes
 
 from mipsjax.data.synth.cull import is_large, nearby
@@ -46,7 +46,7 @@ def reference_mesh(scene: Scene, voxel_m: float = 0.01) -> trimesh.Trimesh:
     vertices, faces = _joined([piece for piece in pieces if piece is not None])
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(digits_vertex=int(np.ceil(-np.log10(_WELD * voxel_m))))
-    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.update_faces(_three_cornered(mesh.faces))
     mesh.remove_unreferenced_vertices()
     bound = jnp.float32(_CORRECTION_VOXELS * voxel_m)
     on_surface = _in_chunks(lambda points: _onto_surface(scene, points, bound), mesh.vertices)
@@ -135,3 +135,9 @@ def _joined(
     firsts = np.cumsum([0, *(len(vertices) for vertices, _ in pieces[:-1])])
     faces = np.concatenate([faces + first for (_, faces), first in zip(pieces, firsts, strict=True)])
     return np.concatenate([vertices for vertices, _ in pieces]), faces
+
+
+def _three_cornered(faces: Int[np.ndarray, "T 3"]) -> Bool[np.ndarray, "T"]:
+    """Faces whose corners are three vertices: welding makes lines of some."""
+    a, b, c = faces.T
+    return (a != b) & (b != c) & (c != a)
