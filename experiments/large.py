@@ -1,10 +1,11 @@
 """Scenes of many submaps: accuracy, loops, seams and memory, with parts of the method switched off.
 
     python experiments/large.py [--names corridor-loop+noise apartment+noise no-loop+noise living] [--seeds 0 1 2]
-                                [--switches full no-lc no-si no-sr] [--stride 1] [--no-surface]
+                                [--switches full no-lc no-si no-sr frustum surface] [--stride 1] [--no-surface]
 
 `living` is `small_house/living` of the development data. The switches are the paper's: no loop closure, no first fit
-of a new submap (SI), no bundle adjustment at a revisit (SR). ATE RMSE after rigid alignment, over all frames. The
+of a new submap (SI), no bundle adjustment at a revisit (SR); `frustum` and `surface` are the other definitions of the
+volume that a submap governs. ATE RMSE after rigid alignment, over all frames. The
 mesh is moved by that same alignment. Accuracy is the mean distance of its vertices to the analytic scene; the sampled
 one and completeness by 1,000,000 points on each mesh. The reference is culled to what the sensor measured from within
 5 m in every 10th frame. So is the mesh for the sampled accuracy, which drops what lies more than 2 cm behind the true
@@ -43,6 +44,8 @@ SWITCHES = {
     "no-lc": ("loop", {"enabled": False}),
     "no-si": ("map", {"submap_steps": 0}),
     "no-sr": ("map", {"revisit_steps": 0}),
+    "frustum": ("volume", {"governs": "frustum"}),
+    "surface": ("volume", {"governs": "surface"}),
 }
 EVERY = 10  # frames whose depth decides what was seen
 SAMPLES = 1_000_000  # on each mesh

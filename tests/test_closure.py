@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from maps import keyframe, pose, state, submap
+from mipsjax import closure
 from mipsjax.closure import solve, without_rejected
 from mipsjax.core import mapping
 from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, distance
+from mipsjax.territory import Sighting, link
 
 CFG = PRESETS["tiny"]
 COUNT = 6
@@ -80,6 +84,32 @@ def test_shared_frames_of_a_rejected_pair_are_dropped_where_they_were_not_tracke
     before = [[k.number for k in submap.keyframes] for submap in given.submaps]
     before[4].append(200)
     assert kept == before
+
+
+def test_a_frame_that_began_a_submap_stays_where_it_was_tracked(ring):
+    """It hangs on the new submap since, and ties it to the one before."""
+    given, _ = ring
+    number = given.submaps[4].keyframes[0].number
+    wrong = given.with_submap(
+        1, keyframes=(*given.submaps[1].keyframes, keyframe(number, pose((0.0, 80.0, 0.0))))
+    )
+    records = [given.records[0]._replace(submap=4 if n == number else COUNT - 1) for n in range(201)]
+    wrong = wrong._replace(records=tuple(records))
+    after = without_rejected(wrong, {(1, 3): 0.0, (1, 4): 0.0})
+    assert [s.keyframes for s in after.submaps] == [s.keyframes for s in given.submaps]
+
+
+def test_a_loop_that_was_not_judged_is_forgotten(ring, monkeypatch):
+    given, _ = ring
+    found = keyframe(200, given.submap.keyframes[0].T_sub_cam)
+    before = given.with_submap(COUNT - 1, keyframes=(*given.submap.keyframes, found))
+    alone = before.with_submap(0, keyframes=before.submaps[0].keyframes[:-1])
+    sighting = Sighting(0, pose(), 0.9)
+    monkeypatch.setattr(closure, "solve", lambda state, *_: (state, {}))
+    no_features = replace(CFG, loop=replace(CFG.loop, features=False))
+    after = closure.close(link(alone, found, sighting), [sighting], alone, no_features)
+    assert after.loops == ()
+    assert [s.keyframes for s in after.submaps] == [s.keyframes for s in alone.submaps]
 
 
 def test_neighbours_along_the_chain_are_never_rejected(ring):

@@ -84,6 +84,23 @@ def test_rows_of_matrices_are_matched_by_row_or_by_fps(pair):
     np.testing.assert_allclose(by_time.T_truth_cam, truth[5:20], atol=1e-9)
 
 
+def test_neighbours_are_those_of_the_estimate_where_the_truth_has_gaps(pair):
+    """What lies between two true poses that are far apart is no interval of one frame."""
+    folder, estimate, truth = pair
+    times = np.arange(40) / 30
+    some = [0, 1, 2, *range(10, 40, 5)]
+    files = (
+        write_tum(folder / "e.txt", estimate, times),
+        write_tum(folder / "t.txt", truth[some], times[some]),
+    )
+    assert evaluate.main([*files, "--json", str(folder / "out.json")]) == 0
+    found = numbers(folder / "out.json")
+    near = metrics.relative_error(estimate[:3], truth[:3])
+    assert found["rpe_trans_m"] == pytest.approx(near.trans_rmse_m, abs=1e-9)
+    assert (found["poses_unmatched"], found["poses_without_truth"]) == (40 - len(some), 0)
+    assert found["poses_compared"] == len(some)
+
+
 def test_missing_truth_is_counted(pair):
     folder, estimate, truth = pair
     truth[[3, 4]] = np.nan
@@ -133,6 +150,7 @@ def broken(folder, case):
         "mesh missing": ([good, good, *mesh, "--reference", "no.ply"], 3, "no.ply"),
         "mesh broken": ([good, good, *mesh, "--reference", str(folder / "junk.ply")], 3, "junk.ply"),
         "zero interval": ([good, good, "--delta", "0"], 2, "--delta"),
+        "seed below zero": ([good, good, "--seed", "-1"], 2, "--seed"),
         "zero fps": ([good, good, "--fps", "0"], 2, "--fps"),
         "unwritable": ([good, good, "--json", str(folder / "no" / "out.json")], 5, "cannot write"),
     }[case]
@@ -140,7 +158,7 @@ def broken(folder, case):
 
 TRAJECTORY_FAULTS = ["missing", "folder", "empty", "words", "binary", "lengths", "no truth", "long interval"]
 MESH_FAULTS = ["mesh alone", "mesh missing", "mesh broken"]
-OPTION_FAULTS = ["zero interval", "zero fps", "unwritable"]
+OPTION_FAULTS = ["zero interval", "seed below zero", "zero fps", "unwritable"]
 
 
 @pytest.mark.parametrize("case", TRAJECTORY_FAULTS + MESH_FAULTS + OPTION_FAULTS)

@@ -155,6 +155,9 @@ def test_14_nothing_usable(program: Program, sequence: Path) -> None:
     image(sequence, "rgb", 0).unlink()
     result = program(sequence)
     assert result.code == 3 and "usable" in result.stderr
+    result = program(sequence, "--input.max-bad-frames", "4")
+    assert result.code == 3 and "none of 5" in result.stderr
+    assert f"the other {FRAMES - 5} were not read: --input.max-bad-frames" in result.stderr
 
 
 def test_15_hardly_any_pixel(program: Program, sequence: Path) -> None:
@@ -265,8 +268,17 @@ def test_40_second_interrupt_ends_at_once(exported: Path, tmp_path: Path) -> Non
     assert "Traceback" not in errors
 
 
+def test_a_reader_that_goes_away_ends_no_run(exported: Path) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    command = [sys.executable, "-m", "mipsjax.run", str(exported), "--inspect"]
+    run = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, timeout=120)
+    os.close(theirs)
+    assert run.returncode == 0 and run.stderr == b""
+
+
 def test_46_folder_cannot_be_written(program: Program, sequence: Path) -> None:
-    for out in (sequence / "rgb.txt" / "out", Path("/proc/nowhere")):
+    for out in (sequence / "rgb.txt" / "out", Path("/proc/nowhere"), sequence.parent / ("long" * 100)):
         result = program(sequence, "--out", str(out))
         assert result.code == 5 and str(out) in result.stderr
 

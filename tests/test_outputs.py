@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ def row(status: str) -> FrameRow:
         ("ok ok ok lost", "failed"),
         ("ok ok ok lost skipped", "failed"),
         ("skipped skipped", "failed"),
+        ("ok skipped skipped", "failed"),
     ],
 )
 def test_verdict(statuses: str, expected: str) -> None:
@@ -86,9 +88,30 @@ def test_metrics_count_what_happened(run: Run) -> None:
         "skipped": 2,
     }
     assert [bad["index"] for bad in content["bad_frames"]] == [0, 2]
-    # One steady frame after the one passed over and the two that compile: 0.2 s
-    assert content["fps"] == pytest.approx(5.0) and content["fps_overall"] == pytest.approx(4 / 1.2)
+    assert content["fps"] is None, "two usable frames, and both compile"
+    assert content["fps_overall"] == pytest.approx(4 / 1.2)
     assert content["te_mean_m"] > 0 and content["seconds"] >= 2.2
+
+
+def test_speed_is_that_of_usable_frames_after_the_two_that_compile(run: Run) -> None:
+    assert run.state is not None
+    first, skipped, last = run.state.records
+    records = (first, skipped, last, last)
+    others = run._replace(state=run.state._replace(records=records), waited=(), step_s=(9.0, 0.01, 9.0, 0.2))
+    assert metrics_content(others, None, {})["fps"] == pytest.approx(5.0)
+
+
+def test_a_measure_that_cannot_be_told_leaves_the_others(run: Run) -> None:
+    sequence = copy(run.sequence)
+    sequence.T_world_cam = run.sequence.T_world_cam.copy()
+    sequence.T_world_cam[2] = np.nan
+    assert run.state is not None
+    records = tuple(record._replace(status=Status.OK) for record in run.state.records)
+    content = metrics_content(
+        run._replace(sequence=sequence, state=run.state._replace(records=records)), None, {}
+    )
+    assert content["rpe_trans_m"] is None and "RPE" in content["protocol"]["rpe_trans_m"]
+    assert content["te_mean_m"] is not None
 
 
 def test_files_are_readable_with_odd_numbers(run: Run, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -129,6 +130,15 @@ def test_help_lists_every_option_with_its_docstring(capsys: pytest.CaptureFixtur
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for expected in ("--track.ro.particles INT", "--frames START:STOP:STEP", "Depth units per metre"):
         assert expected in text
+
+
+def test_help_shows_what_the_preset_sets(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for arguments in (["--help"], ["--preset", "paper", "--help"], ["--preset=paper", "--help"]):
+        with pytest.raises(SystemExit):
+            parse(arguments)
+        shown.append(re.search(r"ro\.particles INT.*?default: (\d+)", capsys.readouterr().out, re.DOTALL)[1])
+    assert shown == [str(preset(name).track.ro.particles) for name in ("default", "paper", "paper")]
 
 
 def test_a_bug_is_one_line_and_a_saved_traceback(

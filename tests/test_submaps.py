@@ -85,6 +85,16 @@ def test_a_second_submap_begins_and_the_first_takes_over_again(states):
     assert states[-1].submaps[1].parent == 0
 
 
+def test_a_new_submap_counts_from_its_anchor(states):
+    """Its support is older, though it comes after it in the list."""
+    begun = next(state for state in states if len(state.submaps) == 2)
+    numbers = [keyframe.number for keyframe in begun.submap.keyframes]
+    assert len(numbers) == 1 + CFG.volume.support and begun.submap.newest == 0
+    assert max(numbers) == numbers[0] == len(begun.records) - 1
+    following = states[len(begun.records)].records[-1]
+    assert following.keyframe == 0 and not following.info.keyframe
+
+
 def test_no_pose_jumps_where_the_submap_changes(states, truth):
     poses = np.stack([world_pose(state, state.records[-1]) for state in states])
     error = poses[:, :3, 3] - truth[:, :3, 3]

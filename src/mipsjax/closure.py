@@ -80,6 +80,10 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
         return state
     doubtful = {loop.frame for loop in state.loops} | ({keyframe.number} if loops else set())
     solved, weights = solve(state, cfg, frozenset(doubtful))
+    if not weights:  # nothing was judged: what was found is forgotten, and may be found again
+        for sighting, _ in loops:
+            state = unlinked(state, sighting.submap, keyframe.number)
+        return state
     moved = distance(_world(state), _world(solved))
     made = tuple(
         Loop(
@@ -90,7 +94,7 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
             inliers=sighting.inliers,
             correction_m=moved[0],
             correction_rad=moved[1],
-            weight=weights.get(_pair(active, sighting.submap), 0.0),
+            weight=weights[_pair(active, sighting.submap)],
         )
         for sighting, how in loops
     )
@@ -146,10 +150,17 @@ def without_rejected(state: SlamState, weights: dict[tuple[int, int], float]) ->
         if weight:
             continue
         for shared in links(state.submaps[j], state.submaps[k]):
-            owner = state.records[shared.first.number].submap
-            for place in {j, k} - {owner}:
-                state = unlinked(state, place, shared.first.number)
+            number = shared.first.number
+            for place in {j, k} - _tracked_in(state, number):
+                state = unlinked(state, place, number)
     return state
+
+
+def _tracked_in(state: SlamState, number: int) -> set[int | None]:
+    """The submap that a frame hangs on, and the one before where a new submap was begun with it."""
+    place = state.records[number].submap
+    submap = state.submaps[place]
+    return {place, submap.parent} if submap.keyframes[0].number == number else {place}
 
 
 def _agrees(state: SlamState, place: int, cfg: Config) -> bool:

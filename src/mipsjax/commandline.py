@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
+import os
 import re
+import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
@@ -63,15 +66,34 @@ def parse(arguments: list[str]) -> Options:
     Raises:
         ConfigError: an option, the preset or the config file is wrong.
     """
-    early = _read(arguments, preset("default"))
-    base = preset(early.preset)
-    options = _read(arguments, base if early.config is None else read_toml(early.config, base))
+    options = _read(arguments, _base(arguments))
     if options.no_loop:
         loop = replace(options.settings.loop, enabled=False)
         options = replace(options, settings=replace(options.settings, loop=loop))
     validate(options.settings)
     parse_frames(options.frames)
     return options
+
+
+def say(text: str) -> None:
+    """Prints, as long as anyone reads: a closed pipe ends no run."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _base(arguments: list[str]) -> Config:
+    """The config that the command line names, before its own options. Raises ConfigError."""
+    names = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    names.add_argument("--preset", default="default")
+    names.add_argument("--config", type=Path)
+    try:
+        named, _ = names.parse_known_args(arguments)
+    except argparse.ArgumentError:  # one without a value, of which the whole command line complains
+        return preset("default")
+    base = preset(named.preset)
+    return base if named.config is None else read_toml(named.config, base)
 
 
 def _read(arguments: list[str], base: Config) -> Options:

@@ -16,12 +16,14 @@ import trimesh
 import tyro
 from jaxtyping import Float64
 
+from mipsjax.commandline import say
 from mipsjax.data.association import associate, sort_stamps
 from mipsjax.data.textfile import content_lines
 from mipsjax.data.trajectory import Trajectory, read_matrix_rows, read_tum
 from mipsjax.errors import ConfigError, InputError, MipsjaxError
 from mipsjax.files import write_atomically
 from mipsjax.host import metrics, surface
+from mipsjax.options import LARGEST_SEED
 
 MATRIX_COLUMNS = 16
 """Numbers in a row of a file of 4 x 4 matrices; a TUM row has 8."""
@@ -77,7 +79,7 @@ class Matched(NamedTuple):
     how: str
     """The protocol of the matching."""
     unmatched: int
-    """Estimated poses that found no partner."""
+    """Estimated poses that found no partner; NaN in the truth."""
 
 
 def evaluate(options: Options) -> list[Row]:
@@ -91,6 +93,8 @@ def evaluate(options: Options) -> list[Row]:
         raise ConfigError("a mesh is measured against a reference: give both --mesh and --reference, or none")
     if options.fps is not None and not options.fps > 0:
         raise ConfigError(f"--fps must be positive, not {options.fps:g}")
+    if not 0 <= options.seed <= LARGEST_SEED:
+        raise ConfigError(f"--seed must be at least 0 and at most {LARGEST_SEED}, not {options.seed}")
     if options.delta < 1 or options.points < 1 or not options.threshold_m > 0 or not options.max_dt >= 0:
         raise ConfigError("--delta, --points and --threshold-m must be positive, --max-dt not negative")
     pair = matched(options.trajectory, options.ground_truth, options.max_dt, options.fps)
@@ -117,7 +121,7 @@ def trajectory_rows(pair: Matched, absolute: metrics.AbsoluteError, delta_frames
     rows = [
         Row("poses_compared", absolute.poses, pair.how),
         Row("poses_unmatched", pair.unmatched, "estimated poses without a true one near in time; left out"),
-        Row("poses_without_truth", absolute.missing_truth, "true pose not finite; left out"),
+        Row("poses_without_truth", absolute.missing_truth - pair.unmatched, "true pose not finite; left out"),
         Row("poses_without_estimate", absolute.missing_estimate, "estimate not finite; left out"),
         Row("ate_rmse_m", absolute.rmse_m, ate),
         Row("ate_mean_m", absolute.mean_m, ate),
@@ -163,8 +167,10 @@ def matched(trajectory: Path, ground_truth: Path, max_dt: float, fps: float | No
             )
         return Matched(estimate.poses, truth.poses, "row by row, since a file has no timestamps", 0)
     first, second = associate(estimate.timestamps, truth.timestamps, max_dt)
+    near = np.full_like(estimate.poses, np.nan)
+    near[first] = truth.poses[second]
     how = f"nearest in time, at most {max_dt:g} s apart"
-    return Matched(estimate.poses[first], truth.poses[second], how, len(estimate.poses) - len(first))
+    return Matched(estimate.poses, near, how, len(estimate.poses) - len(first))
 
 
 class Poses(NamedTuple):
@@ -240,7 +246,7 @@ def main(arguments: list[str] | None = None) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return INTERRUPTED
-    print(format_table(rows))
+    say(format_table(rows))
     return 0
 
 

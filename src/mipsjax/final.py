@@ -48,7 +48,7 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
 
 
 def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
-    """Every trusted frame of a submap at the pose where it fits the finished map; the anchor stays."""
+    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays."""
     small = state.camera.decimated(thumbnail_stride(state.camera))
     submap, records = state.submaps[place], list(state.records)
     places = [i for i, r in enumerate(records) if r.submap == place and r.depth is not None]

@@ -83,7 +83,7 @@ def claimed(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: the folder cannot be made or written, or another run has it.
     """
-    made = not folder.exists()
+    made = not os.path.exists(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(folder / LOCK)
@@ -239,7 +239,7 @@ def _lock(path: Path) -> int:
 
 
 def _has_results(folder: Path) -> bool:
-    return any((folder / name).exists() for name in FINISHED)
+    return any(os.path.exists(folder / name) for name in FINISHED)
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mipsjax import outputs, slam
-from mipsjax.commandline import Options, parse
+from mipsjax.commandline import Options, parse, say
 from mipsjax.config import Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
 from mipsjax.data.sequence import Sequence
@@ -120,24 +120,24 @@ def enable_cache() -> None:
 
 def _run(options: Options) -> int:
     """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
-    cfg, say = options.settings, _teller(options.quiet)
+    cfg, tell = options.settings, _teller(options.quiet)
     enable_cache()
     began = perf_counter()
     sequence = _open(options)
     opened_s = perf_counter() - began
     folder = outputs.choose_folder(sequence.name, options.out, _source(options))
-    with outputs.claimed(folder), _bugs_saved_in(folder), _warnings(say) as remarks, _signals() as stop:
+    with outputs.claimed(folder), _bugs_saved_in(folder), _warnings(tell) as remarks, _signals() as stop:
         outputs.write_config(folder, cfg, _plain_options(options), sequence)
-        say("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
-        with _progress(len(sequence), options.quiet) as tell:
-            run = travel(sequence, cfg, stop, tell)
+        tell("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
+        with _progress(len(sequence), options.quiet) as tell_status:
+            run = travel(sequence, cfg, stop, tell_status)
         if run.state is None:
             raise _nothing_usable(run)
         began = perf_counter()
         mesh = None if options.no_mesh else reconstruct(run.state, cfg)
         seconds = {"open": opened_s, "mesh": perf_counter() - began}
         content = outputs.write_results(folder, run, mesh, seconds, remarks)
-        say(_summary(content))
+        tell(_summary(content))
         return _exit_code(run, folder)
 
 
@@ -169,11 +169,15 @@ def _nothing_usable(run: Run) -> MipsjaxError | KeyboardInterrupt:
     if run.end == "interrupted":
         return KeyboardInterrupt()
     reason = run.waited[-1].info.note if run.waited else "none was read"
-    return InputError(f"none of {len(run.waited)} frames has usable colour and depth, the last one: {reason}")
+    text = f"none of {len(run.waited)} frames has usable colour and depth, the last one: {reason}"
+    more = (
+        f"; the other {len(run.sequence) - len(run.waited)} were not read: --input.max-bad-frames allows more"
+    )
+    return InputError(text + more if run.end == "bad frames" else text)
 
 
 def _inspect(options: Options) -> int:
-    print(describe(_open(options)))
+    say(describe(_open(options)))
     return 0
 
 
@@ -224,7 +228,7 @@ def _summary(content: dict[str, Any]) -> str:
 
 
 def _teller(quiet: bool) -> Callable[[str], None]:
-    return (lambda text: None) if quiet else (lambda text: print(text, flush=True))
+    return (lambda text: None) if quiet else say
 
 
 @contextmanager
@@ -234,12 +238,12 @@ def _progress(count: int, quiet: bool) -> Iterator[Callable[[Status], None]]:
         with tqdm(total=count, unit="frame", file=sys.stderr) as bar:
             yield lambda status: _advance(bar, status)
         return
-    done, say = [0], _teller(quiet)
+    done, tell_line = [0], _teller(quiet)
 
     def tell(status: Status) -> None:
         done[0] += 1
         if done[0] % LINE_EVERY == 0 or done[0] == count:
-            say(f"frame {done[0]} of {count}: {status}")
+            tell_line(f"frame {done[0]} of {count}: {status}")
 
     yield tell
 
@@ -273,14 +277,14 @@ def _signals() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def _warnings(say: Callable[[str], None]) -> Iterator[list[str]]:
+def _warnings(tell: Callable[[str], None]) -> Iterator[list[str]]:
     """Collects what the library logs, and says it."""
     texts: list[str] = []
 
     class Collector(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             texts.append(record.getMessage())
-            say(f"{record.levelname.lower()}: {texts[-1]}")
+            tell(f"{record.levelname.lower()}: {texts[-1]}")
 
     handler, logger = Collector(logging.WARNING), logging.getLogger("mipsjax")
     logger.addHandler(handler)

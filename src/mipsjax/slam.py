@@ -155,11 +155,12 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
 def _views(state: SlamState, cfg: Config) -> Views:
     """Keyframes near the last pose, spread evenly from the oldest, which has drifted least, to the newest."""
     last, go = last_pose(state), cfg.track.go
+    submap = state.submap
     near = [
         keyframe
-        for keyframe in state.submap.keyframes
+        for keyframe in sorted(submap.keyframes, key=lambda keyframe: keyframe.number)
         if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
-    ] or [state.submap.keyframes[-1]]
+    ] or [submap.keyframes[submap.newest]]
     chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
     height, width = near[0].depth.shape
     return Views(
@@ -266,7 +267,7 @@ def _scaled(motion: Pose, ratio: float) -> Pose:
 
 
 def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:
-    keyframe, last = state.submap.keyframes[-1], last_pose(state)
+    keyframe, last = state.submap.keyframes[state.submap.newest], last_pose(state)
     translation, rotation = distance(keyframe.T_sub_cam, T_sub_cam)
     step_translation, step_rotation = distance(last, T_sub_cam)
     return FrameStats(
@@ -293,9 +294,9 @@ def _record(
     keyframe: int | None = None,
 ) -> Record:
     """Hung on a keyframe of the active submap, the newest if none is given."""
-    keyframes = state.submap.keyframes
-    keyframe = len(keyframes) - 1 if keyframe is None else keyframe
-    relative = np.linalg.inv(keyframes[keyframe].T_sub_cam) @ T_sub_cam
+    submap = state.submap
+    keyframe = submap.newest if keyframe is None else keyframe
+    relative = np.linalg.inv(submap.keyframes[keyframe].T_sub_cam) @ T_sub_cam
     return Record(frame.number, frame.timestamp, state.active, keyframe, relative, status, info)
 
 

@@ -50,6 +50,11 @@ class Submap(NamedTuple):
     parent: int | None = None
     """The submap whose keyframe its anchor is; None for the first, and where the camera had been lost."""
 
+    @property
+    def newest(self) -> int:
+        """Place of the newest keyframe: not the last one while a new submap has only those it was begun with."""
+        return max(range(len(self.keyframes)), key=lambda place: self.keyframes[place].number)
+
 
 class Record(NamedTuple):
     """One processed frame. Its pose hangs on a keyframe of a submap, so that bundle adjustment and loop closure move

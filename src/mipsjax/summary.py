@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
@@ -82,11 +83,11 @@ class Number(NamedTuple):
 
 
 def verdict(rows: tuple[FrameRow, ...]) -> Verdict:
-    """`failed`: lost at the end, or in more than half of the frames, or never tracked; `degraded`: lost at
-    times."""
+    """`failed`: lost at the end, or in more than half of the frames, or no frame after the first was usable;
+    `degraded`: lost at times."""
     tracked = [row.status for row in rows if row.status is not Status.SKIPPED]
     lost = tracked.count(Status.LOST)
-    if not tracked or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
+    if len(tracked) < 2 or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
         return "failed"
     return "degraded" if lost else "ok"
 
@@ -139,28 +140,38 @@ def trajectory_errors(run: Run) -> dict[str, Number]:
     if truth is None or run.state is None:
         return {}
     poses = trajectory(run.state)
-    names = ("ate_rmse_m", "ate_mean_m", "rpe_trans_m", "rpe_rot_deg", "te_mean_m")
+
+    def absolute() -> dict[str, Number]:
+        found = metrics.absolute_error(poses, truth)
+        left_out = f"{found.poses} poses, {found.missing_truth} without truth left out, lost frames count"
+        how = f"camera centres, rigid alignment, no scale; {left_out}"
+        return {"ate_rmse_m": Number(found.rmse_m, how), "ate_mean_m": Number(found.mean_m, how)}
+
+    def relative() -> dict[str, Number]:
+        found = metrics.relative_error(poses, truth)
+        how = f"all pairs of neighbouring frames, no alignment, {found.pairs} pairs, RMSE"
+        return {
+            "rpe_trans_m": Number(found.trans_rmse_m, how),
+            "rpe_rot_deg": Number(found.rot_rmse_deg, how),
+        }
+
+    def translation() -> dict[str, Number]:
+        how = "both seen from their first frame, no alignment, mean"
+        return {"te_mean_m": Number(metrics.translation_error(poses, truth).mean_m, how)}
+
+    return (
+        _or_reason(absolute, "ate_rmse_m", "ate_mean_m")
+        | _or_reason(relative, "rpe_trans_m", "rpe_rot_deg")
+        | _or_reason(translation, "te_mean_m")
+    )
+
+
+def _or_reason(measure: Callable[[], dict[str, Number]], *names: str) -> dict[str, Number]:
+    """The numbers of a measure, or why they cannot be told."""
     try:
-        absolute = metrics.absolute_error(poses, truth)
-        relative = metrics.relative_error(poses, truth)
-        translation = metrics.translation_error(poses, truth)
+        return measure()
     except InputError as error:
         return {name: Number(None, str(error)) for name in names}
-    left_out = f"{absolute.poses} poses, {absolute.missing_truth} without truth left out, lost frames count"
-    ate = f"camera centres, rigid alignment, no scale; {left_out}"
-    rpe = f"all pairs of neighbouring frames, no alignment, {relative.pairs} pairs, RMSE"
-    te = "both seen from their first frame, no alignment, mean"
-    values = (
-        absolute.rmse_m,
-        absolute.mean_m,
-        relative.trans_rmse_m,
-        relative.rot_rmse_deg,
-        translation.mean_m,
-    )
-    return {
-        name: Number(*pair)
-        for name, pair in zip(names, zip(values, (ate, ate, rpe, rpe, te), strict=True), strict=True)
-    }
 
 
 def surface_errors(sequence: SynthSequence, run: Run, mesh: trimesh.Trimesh) -> dict[str, Number]:
@@ -199,13 +210,13 @@ def surface_errors(sequence: SynthSequence, run: Run, mesh: trimesh.Trimesh) -> 
 
 def _speed(run: Run) -> dict[str, Number]:
     """Frames a second, with and without the two calls that compile."""
-    compiled = len(run.waited) + 2
-    steady = run.step_s[compiled:]
+    tracked = [s for s, row in zip(run.step_s, run.rows, strict=True) if row.status is not Status.SKIPPED]
+    steady = tracked[2:]
     total = sum(run.step_s) + sum(run.read_s)
     return {
         "fps": Number(
             len(steady) / sum(steady) if steady else None,
-            "processed frames a second without reading images; the first two frames, which compile, left out",
+            "usable frames a second without reading images; the first two, which compile, left out",
         ),
         "fps_overall": Number(
             len(run.step_s) / total if total > 0 else None,

@@ -124,7 +124,8 @@ def _begin_here(state: SlamState, cfg: Config) -> SlamState:
     old = state.submap
     *before, anchor = old.keyframes
     T_new_old = inverse(anchor.T_sub_cam)
-    support = [k._replace(T_sub_cam=T_new_old @ k.T_sub_cam) for k in before[::-1][: cfg.volume.support]]
+    before.sort(key=lambda keyframe: keyframe.number, reverse=True)
+    support = [k._replace(T_sub_cam=T_new_old @ k.T_sub_cam) for k in before[: cfg.volume.support]]
     T_world_sub = old.T_world_sub @ anchor.T_sub_cam
     new, _ = begin(anchor, support, T_world_sub, cfg.map.submap_steps, state.camera, cfg)
     new = new._replace(parent=state.active)

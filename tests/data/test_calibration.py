@@ -12,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mipsjax.core.camera import Intrinsics
-from mipsjax.data.calibration import declared_intrinsics, read_camera_json, require_scale, resolve_intrinsics
+from mipsjax.data.calibration import (
+    DepthScale,
+    Options,
+    declared_intrinsics,
+    frame_rate,
+    read_camera_json,
+    resolve_intrinsics,
+    with_camera_file,
+)
 from mipsjax.errors import ConfigError, InputError
 
 
@@ -26,7 +34,7 @@ def read(text: str) -> Any:
 def test_camera_json() -> None:
     camera = read('{"fx": 1, "fy": 2.5, "cx": 3, "cy": 4, "width": 5, "height": 6, "depth_scale": 1000}')
     assert (camera.calibration.fy, camera.calibration.size) == (2.5, (5, 6))
-    assert (camera.depth_scale, camera.fps) == (1000.0, None)
+    assert (camera.depth_scale, camera.fps) == (DepthScale(1000.0, "camera.json"), None)
 
 
 @pytest.mark.parametrize(
@@ -37,13 +45,14 @@ def test_malformed_camera_json(text: str) -> None:
         read(text)
 
 
+NAMES = ["fx", "fy", "cx", "cy", "width", "height", "depth_scale", "fps"]
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
 )
 
 
-@given(st.dictionaries(st.sampled_from(["fx", "fy", "cx", "cy", "width", "height", "fps"]), json_values))
+@given(st.dictionaries(st.sampled_from(NAMES), json_values))
 def test_any_json_is_a_camera_or_an_error(content: dict[str, Any]) -> None:
     try:
         read(json.dumps(content))
@@ -63,7 +72,25 @@ def test_swapped_declared_intrinsics_are_refused() -> None:
         resolve_intrinsics(declared_intrinsics([320, 240, 585, 585]), (640, 480), (640, 480))
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_depth_scale_must_be_positive(scale: float) -> None:
-    with pytest.raises(InputError, match="positive"):
-        require_scale(scale, 1000.0)
+@pytest.mark.parametrize("name", ["depth_scale", "fps"])
+@pytest.mark.parametrize(
+    ("value", "message"), [("0", "positive"), ("-1", "positive"), ("NaN", "a number"), ("null", "a number")]
+)
+def test_depth_scale_and_rate_must_be_positive(name: str, value: str, message: str) -> None:
+    with pytest.raises(InputError, match=rf"camera\.json: {name} must be {message}"):
+        read(f'{{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "{name}": {value}}}')
+
+
+def test_camera_file_fills_what_options_leave_open(tmp_path: Path) -> None:
+    given_scale = Options(depth_scale=DepthScale(5.0, "--depth-scale"))
+    assert with_camera_file(given_scale, tmp_path) == given_scale
+    (tmp_path / "camera.json").write_text('{"fx": 1, "fy": 2, "cx": 3, "cy": 4, "depth_scale": 7, "fps": 9}')
+    filled = with_camera_file(given_scale, tmp_path)
+    assert filled.intrinsics is not None and filled.intrinsics.source == "camera.json"
+    assert (filled.depth_scale, filled.fps) == (given_scale.depth_scale, 9.0)
+    assert with_camera_file(Options(), tmp_path).depth_scale == DepthScale(7.0, "camera.json")
+
+
+def test_frame_rate() -> None:
+    assert frame_rate(Options(fps=60.0)) == (60.0, ())
+    assert frame_rate(Options()) == (30.0, ("no times known: frames taken to be 1/30 s apart",))

@@ -10,7 +10,7 @@ from write_layouts import FRAMES, color_image, pose, write_folder
 
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data import folder
-from mipsjax.data.calibration import Options, declared_intrinsics
+from mipsjax.data.calibration import DepthScale, Options, declared_intrinsics
 from mipsjax.errors import InputError
 
 
@@ -60,7 +60,7 @@ def test_without_camera_file(root: Path) -> None:
 
 
 def test_options_outweigh_the_camera_file(root: Path) -> None:
-    sequence = folder.read(root, Options(declared_intrinsics([70, 70, 30, 20]), 2000.0))
+    sequence = folder.read(root, Options(declared_intrinsics([70, 70, 30, 20]), DepthScale(2000.0, "")))
     assert sequence.intrinsics == Intrinsics(70, 70, 30, 20, 64, 48)
     depth = sequence[0].depth
     assert depth is not None and depth.max() == 1.0

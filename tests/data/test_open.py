@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,15 @@ from write_layouts import (
 )
 
 from mipsjax.config import InputConfig
-from mipsjax.data.open import LAYOUTS, describe, detect_layout, open_sequence, parse_frames
+from mipsjax.data.imagesequence import ImageSequence
+from mipsjax.data.open import (
+    LAYOUTS,
+    describe,
+    detect_layout,
+    open_sequence,
+    parse_frames,
+    typical_depth,
+)
 from mipsjax.data.sequence import Sequence
 from mipsjax.errors import ConfigError, InputError
 
@@ -42,6 +52,20 @@ WRITERS = {
     "sevenscenes": write_sevenscenes,
     "fastcamo": write_fastcamo,
 }
+
+
+def write_layout(folder: Path, name: str) -> Path:
+    return write_seq(folder / "scene.seq") if name == "seq" else WRITERS[name](folder / "scene")
+
+
+def camera_file(path: Path) -> Path:
+    return (path if path.is_dir() else path.parent) / "camera.json"
+
+
+def opened(path: Path, **options: Any) -> ImageSequence:
+    sequence = open_sequence(path, **options)
+    assert isinstance(sequence, ImageSequence)
+    return sequence
 
 
 def contents(folder: Path) -> dict[str, tuple[int, int]]:
@@ -183,8 +207,51 @@ def test_depth_scale_that_cannot_be(tmp_path: Path, scale: float, median: str) -
 def test_unusual_depth_is_remarked_on(tmp_path: Path) -> None:
     root = write_folder(tmp_path / "kitchen")
     notes = open_sequence(root, depth_scale=100.0).notes
-    assert "median depth of frame 0 is 20 m at 100 units per metre: is --depth-scale right?" in notes
+    assert (
+        "median depth of frame 0 is 20 m at 100 units per metre (from --depth-scale): is --depth-scale right?"
+        in notes
+    )
     assert open_sequence(root).notes == ()
+
+
+@pytest.mark.parametrize("name", [*WRITERS, "seq"])
+def test_depth_scale_is_of_the_option_then_of_the_camera_file(tmp_path: Path, name: str) -> None:
+    path = write_layout(tmp_path, name)
+    own = opened(path, intrinsics=INTRINSICS)
+    scale, median = own.depth_scale.units_per_metre, typical_depth(own)[1]
+    camera_file(path).write_text(json.dumps(CAMERA | {"depth_scale": 2 * scale}))
+    filed, given = opened(path), opened(path, depth_scale=4 * scale)
+    assert f"{2 * scale:g} units per metre (from camera.json)" in describe(filed)
+    assert f"{4 * scale:g} units per metre (from --depth-scale)" in describe(given)
+    np.testing.assert_allclose(typical_depth(filed)[1], median / 2, rtol=1e-6)  # float32 depth
+    np.testing.assert_allclose(typical_depth(given)[1], median / 4, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["replica", "scannet", "sevenscenes", "fastcamo", "seq"])
+def test_rate_is_of_the_camera_file(tmp_path: Path, name: str) -> None:
+    path = write_layout(tmp_path, name)
+    assumed = opened(path, intrinsics=INTRINSICS)
+    assert any("1/30 s apart" in note for note in assumed.notes)
+    camera_file(path).write_text(json.dumps(CAMERA | {"fps": 60.0}))
+    filed = opened(path)
+    np.testing.assert_allclose(filed.timestamps, assumed.timestamps / 2)
+    assert not any("s apart" in note for note in filed.notes)
+    assert filed.calibration.source == "camera.json"
+
+
+@pytest.mark.parametrize("layout", [None, "folder"])
+def test_what_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str | None) -> None:
+    root = write_folder(tmp_path / "kitchen")
+    iterdir = Path.iterdir
+
+    def refuse(path: Path) -> Iterator[Path]:  # instead of chmod, which does not stop root
+        if path.name == "color":
+            raise PermissionError(13, "Permission denied", str(path))
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(InputError, match=r"kitchen/color: cannot be read \(Permission denied\); make it"):
+        open_sequence(root, layout=layout)
 
 
 @pytest.mark.parametrize("scale", [0.0, -5.0, float("nan")])
@@ -245,7 +312,7 @@ def test_describe(tmp_path: Path) -> None:
         "frames        10 in 0.6 s, 66.7 ms apart",
         "size          32 x 24, every 2 pixels of 64 x 48",
         "intrinsics    fx 28.80, fy 28.95, cx 15.75, cy 11.75 (from intrinsic_color.txt)",
-        "depth         1000 units per metre, median 2.00 m in frame 0",
+        "depth         1000 units per metre (from the layout), median 2.00 m in frame 0",
         "ground truth  poses of 9 of 10 frames",
     ]
     assert all(line.startswith("note          ") for line in text.splitlines()[6:])

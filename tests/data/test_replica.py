@@ -53,6 +53,21 @@ def test_without_camera_file(root: Path) -> None:
     assert any("published Replica renders assumed" in note for note in sequence.notes)
 
 
+def test_camera_file_of_ours_comes_first(root: Path) -> None:
+    (root.parent / "cam_params.json").write_text("not needed")
+    text = '{"fx": 61, "fy": 61, "cx": 31.5, "cy": 23.5, "depth_scale": 13107, "fps": 30}'
+    (root / "camera.json").write_text(text)
+    sequence = replica.read(root, Options())
+    assert (sequence.intrinsics.fx, sequence.depth_scale.units_per_metre, sequence.notes) == (61, 13107, ())
+
+
+def test_scale_must_be_positive(root: Path) -> None:
+    file = root.parent / "cam_params.json"
+    file.write_text(file.read_text().replace("6553.5", "0"))
+    with pytest.raises(InputError, match=r"cam_params\.json: scale must be positive, got 0"):
+        replica.read(root, Options())
+
+
 @pytest.mark.parametrize("text", ["[1]", '{"camera": 3}', '{"camera": {"w": 64}}'])
 def test_malformed_camera_file(root: Path, text: str) -> None:
     (root / "cam_params.json").write_text(text)

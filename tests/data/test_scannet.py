@@ -50,6 +50,12 @@ def test_depth_intrinsics_come_first(tmp_path: Path) -> None:
     assert scannet.read(tmp_path / "scene", Options()).intrinsics == Intrinsics(57, 57, 31, 23, 64, 48)
 
 
+def test_camera_file_comes_before_the_exported_intrinsics(tmp_path: Path) -> None:
+    root = write_scannet(tmp_path / "scene")
+    (root / "camera.json").write_text('{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5}')
+    assert scannet.read(root, Options()).intrinsics == Intrinsics(60, 60, 31.5, 23.5, 64, 48)
+
+
 def test_color_of_another_aspect(tmp_path: Path) -> None:
     root = write_scannet(tmp_path / "scene", color_size=(160, 90))
     with pytest.raises(InputError, match="colour is 160 x 90 and depth 64 x 48"):

@@ -104,6 +104,15 @@ def test_frame_numbers_for_times(root: Path) -> None:
     assert "timestamps are frame numbers: frames taken to be 1/30 s apart" in sequence.notes
     assert sequence.T_world_cam is not None
     np.testing.assert_allclose(sequence.T_world_cam[:, 0, 3], np.arange(FRAMES))
+    (root / "camera.json").write_text('{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "fps": 60}')
+    faster = tum.read(root, OPTIONS)
+    np.testing.assert_allclose(faster.timestamps, np.arange(FRAMES) / 60)
+    assert "timestamps are frame numbers: frames taken to be 1/60 s apart" in faster.notes
+
+
+def test_camera_file_leaves_times_alone(root: Path) -> None:
+    (root / "camera.json").write_text('{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "fps": 60}')
+    np.testing.assert_allclose(tum.read(root, Options()).timestamps, 100 + np.arange(FRAMES) / 10)
 
 
 def test_unsorted_and_repeated_rows(root: Path) -> None:

@@ -273,7 +273,7 @@ def track(
 
         def again():
             there = searched(start)
-            better = there[1].residual < after.residual
+            better = (there[1].residual < after.residual) | ~jnp.isfinite(after.residual)
             return jax.tree.map(partial(jnp.where, better), there, (T, after))
 
         if ro.when == "needed":

@@ -14,17 +14,31 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.data.textfile import read_number_block, read_text
 from mipsjax.errors import ConfigError, InputError
 
+CAMERA_FILE = "camera.json"
+
 DEFAULT_FPS = 30.0
 """Used where a layout has no times; the rate of nearly every RGB-D camera."""
-
-MILLIMETRES = 1000.0
-"""Depth units per metre of most sensors."""
 
 ASPECT_TOLERANCE = 0.01
 """How far sizes of one view may differ in aspect: ScanNet's 1296 x 968 and 640 x 480 do by 0.004."""
 
 Size = tuple[int, int]
 """Width and height in pixels."""
+
+
+class DepthScale(NamedTuple):
+    """What a depth of one metre is in a file."""
+
+    units_per_metre: float
+    source: str
+    """Where it comes from, for the user."""
+
+    def __str__(self) -> str:
+        return f"{self.units_per_metre:g} units per metre (from {self.source})"
+
+
+MILLIMETRES = DepthScale(1000.0, "the layout")
+"""Of most sensors."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +60,12 @@ class Calibration:
 
 
 class Options(NamedTuple):
-    """What the user says about a sequence; None for what the layout knows."""
+    """What the user says about a sequence, also in `camera.json`; None for what the layout knows."""
 
     intrinsics: Calibration | None = None
-    depth_scale: float | None = None
-    """Depth units per metre."""
+    depth_scale: DepthScale | None = None
+    fps: float | None = None
+    """Of a layout without times."""
     input: InputConfig = InputConfig()
 
 
@@ -58,8 +73,7 @@ class CameraFile(NamedTuple):
     """Content of `camera.json`."""
 
     calibration: Calibration
-    depth_scale: float | None
-    """Depth units per metre."""
+    depth_scale: DepthScale | None
     fps: float | None
 
 
@@ -75,10 +89,34 @@ def declared_intrinsics(numbers: Sequence[float | int]) -> Calibration:
     return Calibration(fx, fy, cx, cy, size, "--intrinsics", declared=True)
 
 
+def with_camera_file(options: Options, folder: Path) -> Options:
+    """Options that take from the folder's `camera.json`, if there is one, what they leave open.
+
+    Every layout begins with it, so that the order is always: option, `camera.json`, the layout's own.
+    Raises InputError if the file is malformed.
+    """
+    path = folder / CAMERA_FILE
+    if not path.is_file():
+        return options
+    camera = read_camera_json(path)
+    return options._replace(
+        intrinsics=options.intrinsics or camera.calibration,
+        depth_scale=options.depth_scale or camera.depth_scale,
+        fps=options.fps or camera.fps,
+    )
+
+
+def frame_rate(options: Options) -> tuple[float, tuple[str, ...]]:
+    """Frames per second of a layout without times, and a remark if they are assumed."""
+    if options.fps is not None:
+        return options.fps, ()
+    return DEFAULT_FPS, (f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart",)
+
+
 def read_camera_json(path: Path) -> CameraFile:
     """Our own `camera.json`: fx, fy, cx, cy and optionally width, height, depth_scale, fps.
 
-    Raises InputError if a value is missing or no number.
+    Raises InputError if a value is missing, no number, or not positive where it has to be.
     """
     content = read_json(path)
     fx, fy, cx, cy = (json_number(content, name, path) for name in ("fx", "fy", "cx", "cy"))
@@ -86,12 +124,8 @@ def read_camera_json(path: Path) -> CameraFile:
     if "width" in content or "height" in content:
         size = (int(json_number(content, "width", path)), int(json_number(content, "height", path)))
     calibration = Calibration(fx, fy, cx, cy, size, path.name)
-    optional = (
-        json_number(content, name, path) if name in content else None for name in ("depth_scale", "fps")
-    )
-    depth_scale, fps = optional
-    if fps is not None and not fps > 0:
-        raise InputError(f"{path}: fps must be positive, got {fps:g}")
+    depth_scale = json_depth_scale(content, "depth_scale", path) if "depth_scale" in content else None
+    fps = json_positive(content, "fps", path) if "fps" in content else None
     return CameraFile(calibration, depth_scale, fps)
 
 
@@ -114,19 +148,24 @@ def json_number(content: dict[str, Any], name: str, path: Path) -> float:
     return float(value)
 
 
+def json_positive(content: dict[str, Any], name: str, path: Path) -> float:
+    """One finite number above zero. Raises InputError naming file and value."""
+    value = json_number(content, name, path)
+    if not value > 0:
+        raise InputError(f"{path}: {name} must be positive, got {value:g}")
+    return value
+
+
+def json_depth_scale(content: dict[str, Any], name: str, path: Path) -> DepthScale:
+    """Depth units per metre. Raises InputError naming file and value."""
+    return DepthScale(json_positive(content, name, path), path.name)
+
+
 def read_matrix_intrinsics(path: Path, rows: int, size: Size | Literal["color", "depth"]) -> Calibration:
     """Intrinsics from a text file with a square matrix of `rows` rows. Raises InputError."""
     matrix = read_number_block(path, rows, rows)
     fx, fy, cx, cy = (float(value) for value in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
     return Calibration(fx, fy, cx, cy, size, path.name)
-
-
-def require_scale(depth_scale: float | None, default: float) -> float:
-    """Depth units per metre: the given ones or the layout's. Raises InputError if they are not positive."""
-    scale = default if depth_scale is None else depth_scale
-    if not (scale > 0 and math.isfinite(scale)):
-        raise InputError(f"the depth scale must be a positive number of units per metre, got {scale:g}")
-    return scale
 
 
 def resolve_intrinsics(

@@ -12,10 +12,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from mipsjax.data.calibration import DEFAULT_FPS, MILLIMETRES, Calibration, Options, require_scale
+from mipsjax.data.calibration import (
+    CAMERA_FILE,
+    MILLIMETRES,
+    Calibration,
+    Options,
+    frame_rate,
+    with_camera_file,
+)
 from mipsjax.data.images import DEPTH_BITS, ImageHeader
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
-from mipsjax.data.scannet import camera_json, find_root, has_png_color, read_frames
+from mipsjax.data.scannet import find_root, has_png_color, read_frames
 from mipsjax.errors import InputError
 
 LAYOUT = "fastcamo"
@@ -77,11 +84,10 @@ def matches(path: Path) -> bool:
 def read(path: Path, options: Options) -> ImageSequence:
     """Opens a folder or a `.seq` file. Raises InputError."""
     if path.is_file():
-        return _read_seq(path, options)
-    calibration, notes = options.intrinsics or camera_json(path), ()
-    if calibration is None:
-        calibration, notes = SYNTHETIC, (f"intrinsics of {SYNTHETIC.source} assumed",)
-    return read_frames(path, LAYOUT, calibration, options, notes)
+        return _read_seq(path, with_camera_file(options, path.parent))
+    options = with_camera_file(options, path)
+    notes = () if options.intrinsics else (f"intrinsics of {SYNTHETIC.source} assumed",)
+    return read_frames(path, LAYOUT, options.intrinsics or SYNTHETIC, options, notes)
 
 
 def open_seq(path: Path) -> tuple[SeqFile, tuple[str, ...]]:
@@ -105,20 +111,20 @@ def open_seq(path: Path) -> tuple[SeqFile, tuple[str, ...]]:
 
 def _read_seq(path: Path, options: Options) -> ImageSequence:
     source, notes = open_seq(path)
-    calibration = options.intrinsics or camera_json(path.parent)
-    if calibration is None:
+    if options.intrinsics is None:
         raise InputError(
-            f"{path}: a .seq file holds no intrinsics; pass --intrinsics FX FY CX CY or put camera.json "
+            f"{path}: a .seq file holds no intrinsics; pass --intrinsics FX FY CX CY or put {CAMERA_FILE} "
             "beside it"
         )
+    fps, rate_notes = frame_rate(options)
     return image_sequence(
         name=path.stem,
         layout=LAYOUT,
         source=source,
-        timestamps=np.arange(len(source)) / DEFAULT_FPS,
+        timestamps=np.arange(len(source)) / fps,
         T_world_cam=None,
-        calibration=calibration,
-        depth_scale=require_scale(options.depth_scale, MILLIMETRES),
+        calibration=options.intrinsics,
+        depth_scale=options.depth_scale or MILLIMETRES,
         input=options.input,
-        notes=(*notes, f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart"),
+        notes=notes + rate_notes,
     )

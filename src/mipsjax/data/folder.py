@@ -8,14 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mipsjax.data.calibration import (
-    DEFAULT_FPS,
-    MILLIMETRES,
-    CameraFile,
-    Options,
-    read_camera_json,
-    require_scale,
-)
+from mipsjax.data.calibration import CAMERA_FILE, MILLIMETRES, Options, frame_rate, with_camera_file
 from mipsjax.data.framefiles import (
     COLOR_SUFFIXES,
     DEPTH_SUFFIXES,
@@ -30,9 +23,7 @@ from mipsjax.data.trajectory import read_matrix_rows
 from mipsjax.errors import InputError
 
 LAYOUT = "folder"
-MARKERS = "color/, depth/, camera.json"
-
-CAMERA_FILE = "camera.json"
+MARKERS = f"color/, depth/, {CAMERA_FILE}"
 
 
 def matches(path: Path) -> bool:
@@ -46,7 +37,12 @@ def read(path: Path, options: Options) -> ImageSequence:
         list_files(path / "color", COLOR_SUFFIXES), list_files(path / "depth", DEPTH_SUFFIXES), _stem
     )
     require_images(files, path, "depth/*.png")
-    camera, notes = _camera(path, options)
+    options = with_camera_file(options, path)
+    if options.intrinsics is None:
+        raise InputError(f"{path}: no {CAMERA_FILE}; pass --intrinsics FX FY CX CY")
+    fps, notes = frame_rate(options)
+    if options.depth_scale is None:
+        notes += ("no depth scale known: depth taken to be in millimetres",)
     poses = None
     if (path / "poses.txt").is_file():
         rows, pose_notes = read_matrix_rows(path / "poses.txt")
@@ -56,29 +52,13 @@ def read(path: Path, options: Options) -> ImageSequence:
         name=path.name,
         layout=LAYOUT,
         source=files,
-        timestamps=numbered_times(keys, camera.fps or DEFAULT_FPS),
+        timestamps=numbered_times(keys, fps),
         T_world_cam=poses,
-        calibration=camera.calibration,
-        depth_scale=require_scale(options.depth_scale or camera.depth_scale, MILLIMETRES),
+        calibration=options.intrinsics,
+        depth_scale=options.depth_scale or MILLIMETRES,
         input=options.input,
         notes=notes,
     )
-
-
-def _camera(path: Path, options: Options) -> tuple[CameraFile, tuple[str, ...]]:
-    """`camera.json`, its intrinsics replaced by declared ones, and remarks on what is assumed."""
-    if (path / CAMERA_FILE).is_file():
-        camera = read_camera_json(path / CAMERA_FILE)
-    elif options.intrinsics is not None:
-        camera = CameraFile(options.intrinsics, None, None)
-    else:
-        raise InputError(f"{path}: no {CAMERA_FILE}; pass --intrinsics FX FY CX CY")
-    notes = []
-    if camera.fps is None:
-        notes.append(f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart")
-    if camera.depth_scale is None and options.depth_scale is None:
-        notes.append("no depth scale known: depth taken to be in millimetres")
-    return camera._replace(calibration=options.intrinsics or camera.calibration), tuple(notes)
 
 
 def _stem(path: Path) -> str:

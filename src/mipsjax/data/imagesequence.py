@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int, UInt8, UInt16
 from mipsjax.config import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.association import sort_stamps
-from mipsjax.data.calibration import Calibration, Size, resolve_intrinsics, same_aspect
+from mipsjax.data.calibration import Calibration, DepthScale, Size, resolve_intrinsics, same_aspect
 from mipsjax.data.framefiles import FrameSource
 from mipsjax.data.images import DEPTH_BITS, ImageHeader, depth_to_metres, depth_type_message
 from mipsjax.data.sequence import Frame
@@ -71,8 +71,7 @@ class ImageSequence:
     shape: Shape = field(repr=False)
     calibration: Calibration
     """Intrinsics as they were given."""
-    depth_scale: float
-    """Depth units per metre."""
+    depth_scale: DepthScale
     input: InputConfig
     """Range of depth and working width."""
 
@@ -85,14 +84,16 @@ class ImageSequence:
         raw, depth_problem = self._raw_depth(place)
         depth = None
         if raw is not None:
-            depth = depth_to_metres(raw, self.depth_scale, self.input.depth_min, self.input.depth_max)
+            units = self.depth_scale.units_per_metre
+            depth = depth_to_metres(raw, units, self.input.depth_min, self.input.depth_max)
         problem = "; ".join(filter(None, (color_problem, depth_problem)))
         return Frame(int(self.numbers[position]), float(self.timestamps[position]), color, depth, problem)
 
     def unclipped_depth(self, position: int) -> Float32[np.ndarray, "H W"] | None:
         """Depth in metres without the range of the config, to judge the depth scale; None if unreadable."""
         raw, _ = self._raw_depth(int(self.positions[position]))
-        return None if raw is None else depth_to_metres(raw, self.depth_scale, 0.0, float("inf"))
+        units = self.depth_scale.units_per_metre
+        return None if raw is None else depth_to_metres(raw, units, 0.0, float("inf"))
 
     def select(self, frames: slice) -> ImageSequence:
         """The frames of a slice; they keep their numbers. Nothing is read."""
@@ -137,7 +138,7 @@ def image_sequence(
     timestamps: Float64[np.ndarray, "N"],
     T_world_cam: Float64[np.ndarray, "N 4 4"] | None,
     calibration: Calibration,
-    depth_scale: float,
+    depth_scale: DepthScale,
     input: InputConfig,
     notes: tuple[str, ...] = (),
 ) -> ImageSequence:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mipsjax.config import InputConfig
 from mipsjax.data import fastcamo, folder, replica, scannet, sevenscenes, tum
-from mipsjax.data.calibration import Options, declared_intrinsics
+from mipsjax.data.calibration import DepthScale, Options, declared_intrinsics
 from mipsjax.data.imagesequence import ImageSequence
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.trajectory import known_poses
@@ -82,12 +82,20 @@ def open_sequence(
         return open_synth(str(path).removeprefix(SYNTH_PREFIX), frames, input)
     if depth_scale is not None and not 0 < depth_scale < float("inf"):
         raise ConfigError(f"--depth-scale must be a positive number of units per metre, got {depth_scale:g}")
-    options = Options(None if intrinsics is None else declared_intrinsics(intrinsics), depth_scale, input)
+    options = Options(
+        intrinsics=None if intrinsics is None else declared_intrinsics(intrinsics),
+        depth_scale=None if depth_scale is None else DepthScale(depth_scale, "--depth-scale"),
+        input=input,
+    )
     place = _require_path(Path(path))
-    name = layout or detect_layout(place)
-    if name not in LAYOUTS:
-        raise ConfigError(f"--layout {name}: unknown, choose one of {', '.join(LAYOUTS)}")
-    sequence = _select(LAYOUTS[name].read(place, options), frames)
+    try:
+        name = layout or detect_layout(place)
+        if name not in LAYOUTS:
+            raise ConfigError(f"--layout {name}: unknown, choose one of {', '.join(LAYOUTS)}")
+        sequence = _select(LAYOUTS[name].read(place, options), frames)
+    except OSError as error:
+        what, why = error.filename or place, error.strerror or error
+        raise InputError(f"{what}: cannot be read ({why}); make it readable, as by chmod -R u+rX") from error
     return sequence.with_notes(check_depth_scale(sequence))
 
 
@@ -121,9 +129,11 @@ def check_depth_scale(sequence: ImageSequence) -> tuple[str, ...]:
     position, median = typical_depth(sequence)
     low, high = DEPTH_POSSIBLE_M
     number = int(sequence.numbers[position])
-    found = f"median depth of frame {number} is {median:.3g} m at {sequence.depth_scale:g} units per metre"
+    found = f"median depth of frame {number} is {median:.3g} m at {sequence.depth_scale}"
     if not low <= median <= high:
-        raise InputError(f"{found}: pass --depth-scale{_suggestion(median * sequence.depth_scale)}")
+        raise InputError(
+            f"{found}: pass --depth-scale{_suggestion(median * sequence.depth_scale.units_per_metre)}"
+        )
     if not DEPTH_USUAL_M[0] <= median <= DEPTH_USUAL_M[1]:
         return (f"{found}: is --depth-scale right?",)
     return ()
@@ -223,7 +233,7 @@ def _depth_text(sequence: Sequence) -> str:
         return "metres"
     position, median = typical_depth(sequence)
     number = int(sequence.numbers[position])
-    return f"{sequence.depth_scale:g} units per metre, median {median:.2f} m in frame {number}"
+    return f"{sequence.depth_scale}, median {median:.2f} m in frame {number}"
 
 
 def _truth_text(sequence: Sequence) -> str:

@@ -8,12 +8,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipsjax.data.calibration import (
-    DEFAULT_FPS,
     Calibration,
+    DepthScale,
     Options,
+    frame_rate,
+    json_depth_scale,
     json_number,
     read_json,
-    require_scale,
+    with_camera_file,
 )
 from mipsjax.data.framefiles import (
     COLOR_SUFFIXES,
@@ -31,10 +33,10 @@ from mipsjax.errors import InputError
 LAYOUT = "replica"
 MARKERS = "results/frame*.jpg, results/depth*.png, traj.txt"
 
-DEPTH_UNITS_PER_METRE = 6553.5
-"""Of the published renders, where 65535 is ten metres."""
-
 PUBLISHED = Calibration(600.0, 600.0, 599.5, 339.5, (1200, 680), "the published Replica renders")
+
+DEPTH_SCALE = DepthScale(6553.5, PUBLISHED.source)
+"""65535 is ten metres."""
 
 _CAMERA_FILE = "cam_params.json"
 _COLOR, _DEPTH = "frame", "depth"
@@ -51,7 +53,9 @@ def read(path: Path, options: Options) -> ImageSequence:
     depths = [file for file in list_files(path / "results", DEPTH_SUFFIXES) if file.name.startswith(_DEPTH)]
     keys, files = pair_by_name(colors, depths, _number)
     require_images(files, path, "results/depth*.png")
-    calibration, scale, notes = _camera(path)
+    options = with_camera_file(options, path)
+    calibration, scale, notes = _camera(path, options)
+    fps, rate_notes = frame_rate(options)
     poses = None
     if (path / "traj.txt").is_file():
         rows, pose_notes = read_matrix_rows(path / "traj.txt")
@@ -61,29 +65,38 @@ def read(path: Path, options: Options) -> ImageSequence:
         name=path.name,
         layout=LAYOUT,
         source=files,
-        timestamps=numbered_times(keys, DEFAULT_FPS),
+        timestamps=numbered_times(keys, fps),
         T_world_cam=poses,
-        calibration=options.intrinsics or calibration,
-        depth_scale=require_scale(options.depth_scale, scale),
+        calibration=calibration,
+        depth_scale=scale,
         input=options.input,
-        notes=(*notes, f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart"),
+        notes=notes + rate_notes,
     )
 
 
-def _camera(path: Path) -> tuple[Calibration, float, tuple[str, ...]]:
-    """Intrinsics, depth units per metre and remarks, from the folder or the one above it."""
+def _camera(path: Path, options: Options) -> tuple[Calibration, DepthScale, tuple[str, ...]]:
+    """Intrinsics, depth scale and remarks; the file is looked at only for what the options leave open."""
+    if options.intrinsics and options.depth_scale:
+        return options.intrinsics, options.depth_scale, ()
+    calibration, scale, notes = _camera_params(path)
+    return options.intrinsics or calibration, options.depth_scale or scale, notes
+
+
+def _camera_params(path: Path) -> tuple[Calibration, DepthScale, tuple[str, ...]]:
+    """Intrinsics, depth scale and remarks, from the folder or the one above it."""
     places = (path / _CAMERA_FILE, path.parent / _CAMERA_FILE)
     file = next((place for place in places if place.is_file()), None)
     if file is None:
         note = f"no {_CAMERA_FILE}: camera and depth scale of {PUBLISHED.source} assumed"
-        return PUBLISHED, DEPTH_UNITS_PER_METRE, (note,)
+        return PUBLISHED, DEPTH_SCALE, (note,)
     content = read_json(file)
     camera = content.get("camera", content)
     if not isinstance(camera, dict):
         raise InputError(f"{file}: 'camera' must hold the values w, h, fx, fy, cx, cy, scale")
-    width, height, fx, fy, cx, cy, scale = (
-        json_number(camera, name, file) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    width, height, fx, fy, cx, cy = (
+        json_number(camera, name, file) for name in ("w", "h", "fx", "fy", "cx", "cy")
     )
+    scale = json_depth_scale(camera, "scale", file)
     return Calibration(fx, fy, cx, cy, (int(width), int(height)), file.name), scale, ()
 
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipsjax.data.calibration import (
-    DEFAULT_FPS,
     MILLIMETRES,
     Calibration,
     Options,
-    read_camera_json,
+    frame_rate,
     read_matrix_intrinsics,
-    require_scale,
+    with_camera_file,
 )
 from mipsjax.data.framefiles import (
     COLOR_SUFFIXES,
@@ -54,6 +53,7 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, options: Options) -> ImageSequence:
     """Opens a folder. Raises InputError."""
+    options = with_camera_file(options, path)
     calibration = options.intrinsics or _calibration(path)
     if calibration is None:
         raise InputError(f"{path}: no intrinsic/intrinsic_*.txt; pass --intrinsics FX FY CX CY")
@@ -73,34 +73,29 @@ def read_frames(
     poses, pose_notes = read_matrix_files(
         [root / "pose" / f"{stem.stem}.txt" if stem else None for stem in stems], "pose/"
     )
+    fps, rate_notes = frame_rate(options)
     return image_sequence(
         name=path.name,
         layout=layout,
         source=files,
-        timestamps=numbered_times(keys, DEFAULT_FPS),
+        timestamps=numbered_times(keys, fps),
         T_world_cam=poses,
         calibration=calibration,
-        depth_scale=require_scale(options.depth_scale, MILLIMETRES),
+        depth_scale=options.depth_scale or MILLIMETRES,
         input=options.input,
-        notes=(*notes, *pose_notes, f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart"),
+        notes=notes + pose_notes + rate_notes,
     )
 
 
-def camera_json(path: Path) -> Calibration | None:
-    """Intrinsics of a `camera.json` that the user has put beside the images."""
-    file = path / "camera.json"
-    return read_camera_json(file).calibration if file.is_file() else None
-
-
 def _calibration(path: Path) -> Calibration | None:
-    """Depth intrinsics where there are some, else those of colour, else `camera.json`."""
+    """Depth intrinsics where there are some, else those of colour."""
     folder = _intrinsic_folder(path)
     if folder is not None:
         for kind in ("depth", "color"):
             file = folder / f"intrinsic_{kind}.txt"
             if file.is_file():
                 return read_matrix_intrinsics(file, _INTRINSIC_ROWS, kind)
-    return camera_json(path)
+    return None
 
 
 def _intrinsic_folder(path: Path) -> Path | None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipsjax.data.calibration import (
-    DEFAULT_FPS,
     MILLIMETRES,
     Calibration,
     Options,
+    frame_rate,
     read_matrix_intrinsics,
-    require_scale,
+    with_camera_file,
 )
 from mipsjax.data.framefiles import (
     COLOR_SUFFIXES,
@@ -44,6 +44,7 @@ def matches(path: Path) -> bool:
 def read(path: Path, options: Options) -> ImageSequence:
     """Opens a sequence, or the only sequence of a scene. Raises InputError if a scene has several."""
     folder, notes = _choose(path)
+    options = with_camera_file(options, folder)
     colors = [file for file in list_files(folder, COLOR_SUFFIXES) if ".color." in file.name]
     depths = [file for file in list_files(folder, DEPTH_SUFFIXES) if ".depth." in file.name]
     keys, files = pair_by_name(colors, depths, _frame_name)
@@ -53,20 +54,21 @@ def read(path: Path, options: Options) -> ImageSequence:
         [_pose_file(depth or color) for depth, color in places], "*.pose.txt"
     )
     calibration, camera_notes = _calibration(folder, options)
+    fps, rate_notes = frame_rate(options)
     return image_sequence(
         name=folder.name,
         layout=LAYOUT,
         source=files,
-        timestamps=numbered_times(keys, DEFAULT_FPS),
+        timestamps=numbered_times(keys, fps),
         T_world_cam=poses,
         calibration=calibration,
-        depth_scale=require_scale(options.depth_scale, MILLIMETRES),
+        depth_scale=options.depth_scale or MILLIMETRES,
         input=options.input,
         notes=(
             *notes,
             *camera_notes,
             *pose_notes,
-            f"no times known: frames taken to be 1/{DEFAULT_FPS:g} s apart",
+            *rate_notes,
             "colour is not registered to depth in 7-Scenes: it is off by some pixels",
         ),
     )

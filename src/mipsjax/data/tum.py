@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.data.association import associate, poses_at, sort_stamps
-from mipsjax.data.calibration import DEFAULT_FPS, Calibration, Options, read_camera_json, require_scale
+from mipsjax.data.calibration import DEFAULT_FPS, Calibration, DepthScale, Options, with_camera_file
 from mipsjax.data.framefiles import ImageFiles
 from mipsjax.data.images import DEPTH_BITS, read_header
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
@@ -24,7 +24,7 @@ from mipsjax.errors import InputError
 LAYOUT = "tum"
 MARKERS = "rgb.txt, depth.txt; or associations.txt"
 
-DEPTH_UNITS_PER_METRE = 5000.0
+DEPTH_SCALE = DepthScale(5000.0, "the layout")
 
 CAMERAS = {
     "1": Calibration(
@@ -60,12 +60,13 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, options: Options) -> ImageSequence:
     """Opens a folder. Raises InputError."""
+    options = with_camera_file(options, path)
     associations = _first_file(path, _ASSOCIATIONS)
     listing = read_associations(associations) if associations else read_lists(path)
     calibration, camera_notes = _calibration(path, options)
     truth = _first_file(path, _GROUND_TRUTH)
     poses, truth_notes = _poses(truth, listing.timestamps) if truth else (None, ())
-    times, time_notes = _seconds(listing.timestamps)
+    times, time_notes = _seconds(listing.timestamps, options.fps or DEFAULT_FPS)
     return image_sequence(
         name=path.name,
         layout=LAYOUT,
@@ -73,7 +74,7 @@ def read(path: Path, options: Options) -> ImageSequence:
         timestamps=times,
         T_world_cam=poses,
         calibration=calibration,
-        depth_scale=require_scale(options.depth_scale, DEPTH_UNITS_PER_METRE),
+        depth_scale=options.depth_scale or DEPTH_SCALE,
         input=options.input,
         notes=listing.notes + camera_notes + time_notes + truth_notes,
     )
@@ -119,8 +120,6 @@ def camera_from_name(path: Path) -> Calibration | None:
 def _calibration(path: Path, options: Options) -> tuple[Calibration, tuple[str, ...]]:
     if options.intrinsics is not None:
         return options.intrinsics, ()
-    if (path / "camera.json").is_file():
-        return read_camera_json(path / "camera.json").calibration, ()
     camera = camera_from_name(path)
     if camera is None:
         raise InputError(
@@ -142,12 +141,13 @@ def _poses(
     return poses, (f"{truth.name}: true pose known for {known} of {len(poses)} frames",)
 
 
-def _seconds(timestamps: Float64[np.ndarray, "N"]) -> tuple[Float64[np.ndarray, "N"], tuple[str, ...]]:
+def _seconds(
+    timestamps: Float64[np.ndarray, "N"], fps: float
+) -> tuple[Float64[np.ndarray, "N"], tuple[str, ...]]:
     """Timestamps that are frame numbers, as in ICL-NUIM, become seconds."""
     steps = np.diff(np.sort(timestamps))
     if len(steps) and np.all(timestamps == np.round(timestamps)) and np.median(steps) == 1.0:
-        note = f"timestamps are frame numbers: frames taken to be 1/{DEFAULT_FPS:g} s apart"
-        return timestamps / DEFAULT_FPS, (note,)
+        return timestamps / fps, (f"timestamps are frame numbers: frames taken to be 1/{fps:g} s apart",)
     return timestamps, ()
 
 
