@@ -1,13 +1,13 @@
 """Poses where the camera enters a known submap again, with and without bundle adjustment before it.
 
-    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--seed 0] [--variants full ...]
+    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--once] [--seed 0] [--variants full ...]
 
 The first frames of a synthetic scene and the same backwards, so that submaps are left and entered again with the
-drift of the way between. `full`: the frame with which a known submap takes over is registered in it, bundle
-adjustment follows (SR), and the pose graph is solved (LC); without SR, without LC, without both; `none`: without
-registration either, the pose in the known submap is what the world poses of the submaps say. RPE over one frame
-(translation, cm). Writes `revisit.csv`, a row each variant with the RPE in the 10 frames from a revisit on and
-elsewhere, and a plot.
+drift of the way between; `--once` for a scene that comes back to its beginning on its own. `full`: the frame with
+which a known submap takes over is registered in it, bundle adjustment follows (SR), and the pose graph is solved
+(LC); without SR, without LC, without both; `none`: without registration either, the pose in the known submap is what
+the world poses of the submaps say. RPE over one frame (translation, cm). Writes `revisit.csv`, a row each variant
+with the RPE in the 10 frames from a revisit on and elsewhere, and a plot.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ def main() -> None:
     )
     parser.add_argument("--name", default="apartment+noise")
     parser.add_argument("--frames", type=int, default=450)
+    parser.add_argument("--once", action="store_true", help="not backwards")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     options = parser.parse_args()
@@ -64,7 +65,7 @@ def main() -> None:
         cfg = changed(Config(seed=options.seed), "map", revisit_steps=variant.revisit_steps)
         cfg = changed(cfg, "loop", enabled=variant.loop)
         with nullcontext() if variant.registered else unregistered():
-            rpe, active, ate = trial(options.name, options.frames, cfg)
+            rpe, active, ate = trial(options.name, options.frames, options.once, cfg)
         entered = [i for i, (a, b) in enumerate(pairwise(active)) if b < a]
         near = np.zeros(len(rpe), bool)
         for i in entered:
@@ -108,10 +109,11 @@ def unregistered() -> Iterator[None]:
         territory.sight = original
 
 
-def trial(name: str, count: int, cfg: Config) -> tuple[np.ndarray, list[int], float]:
+def trial(name: str, count: int, once: bool, cfg: Config) -> tuple[np.ndarray, list[int], float]:
     """RPE of each frame (cm), the submap of each, and ATE (cm)."""
     sequence = open_sequence(f"synth:{name}", frames=slice(0, count), input=cfg.input)
-    order = [*range(count), *range(count - 2, -1, -1)]
+    count = len(sequence)
+    order = [*range(count), *([] if once else range(count - 2, -1, -1))]
     truth = sequence.T_world_cam[order]
     state = follow((sequence[i] for i in order), sequence.intrinsics, cfg, truth[0])
     poses = trajectory(state)

@@ -153,12 +153,12 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
 
 
 def _views(state: SlamState, cfg: Config) -> Views:
-    """Keyframes near the last pose, spread evenly from the oldest, which has drifted least, to the newest."""
+    """Keyframes near the last pose, spread evenly from the anchor, or the oldest after it, to the newest."""
     last, go = last_pose(state), cfg.track.go
     submap = state.submap
     near = [
         keyframe
-        for keyframe in sorted(submap.keyframes, key=lambda keyframe: keyframe.number)
+        for keyframe in submap.keyframes
         if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
     ] or [submap.keyframes[submap.newest]]
     chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
