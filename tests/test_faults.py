@@ -268,13 +268,16 @@ def test_40_second_interrupt_ends_at_once(exported: Path, tmp_path: Path) -> Non
     assert "Traceback" not in errors
 
 
-def test_a_reader_that_goes_away_ends_no_run(exported: Path) -> None:
+def test_a_reader_that_goes_away_ends_no_run(exported: Path, tmp_path: Path) -> None:
     ours, theirs = os.pipe()
     os.close(ours)
-    command = [sys.executable, "-m", "mipsjax.run", str(exported), "--inspect"]
-    run = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, timeout=120)
+    options = ["--preset", "tiny", "--frames", ":3", "--no-mesh", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "mipsjax.run", str(exported), *options]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir or "")}
+    run = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, env=environment, timeout=300)
     os.close(theirs)
-    assert run.returncode == 0 and run.stderr == b""
+    assert run.returncode == 0 and b"Traceback" not in run.stderr
+    assert (tmp_path / "out" / "metrics.json").exists()
 
 
 def test_46_folder_cannot_be_written(program: Program, sequence: Path) -> None:

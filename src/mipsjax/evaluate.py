@@ -67,8 +67,10 @@ class Row(NamedTuple):
 
     name: str
     """Key in the JSON file; ends with the unit."""
-    value: float | int
+    value: float | int | None
+    """None where it cannot be told."""
     protocol: str
+    """Or why it cannot be told."""
 
 
 class Matched(NamedTuple):
@@ -112,11 +114,7 @@ def evaluate(options: Options) -> list[Row]:
 
 
 def trajectory_rows(pair: Matched, absolute: metrics.AbsoluteError, delta_frames: int) -> list[Row]:
-    """The numbers of a matched pair of trajectories.
-
-    Raises:
-        InputError: no pair of poses is `delta_frames` apart.
-    """
+    """The numbers of a matched pair of trajectories; RPE is None if no true poses are `delta_frames` apart."""
     ate = "camera centres, rigid alignment of all compared poses, no scale"
     rows = [
         Row("poses_compared", absolute.poses, pair.how),
@@ -128,9 +126,15 @@ def trajectory_rows(pair: Matched, absolute: metrics.AbsoluteError, delta_frames
         Row("ate_median_m", absolute.median_m, ate),
         Row("ate_max_m", absolute.max_m, ate),
     ]
-    relative = metrics.relative_error(pair.T_world_cam, pair.T_truth_cam, delta_frames)
-    rpe = f"all pairs {delta_frames} frame(s) apart, no alignment, {relative.pairs} pairs, RMSE"
-    rows += [Row("rpe_trans_m", relative.trans_rmse_m, rpe), Row("rpe_rot_deg", relative.rot_rmse_deg, rpe)]
+    try:
+        relative = metrics.relative_error(pair.T_world_cam, pair.T_truth_cam, delta_frames)
+        rpe = f"all pairs {delta_frames} frame(s) apart, no alignment, {relative.pairs} pairs, RMSE"
+        rows += [
+            Row("rpe_trans_m", relative.trans_rmse_m, rpe),
+            Row("rpe_rot_deg", relative.rot_rmse_deg, rpe),
+        ]
+    except InputError as error:
+        rows += [Row(name, None, str(error)) for name in ("rpe_trans_m", "rpe_rot_deg")]
     te = metrics.translation_error(pair.T_world_cam, pair.T_truth_cam)
     return [*rows, Row("te_mean_m", te.mean_m, "both seen from their first frame, no alignment, mean")]
 
@@ -215,7 +219,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
 def format_table(rows: list[Row]) -> str:
     """The numbers, aligned, each with its protocol."""
-    values = [f"{row.value:d}" if isinstance(row.value, int) else f"{row.value:.6f}" for row in rows]
+    values = [_shown(row.value) for row in rows]
     widths = max(len(row.name) for row in rows), max(len(value) for value in values)
     return "\n".join(
         f"{row.name:<{widths[0]}}  {value:>{widths[1]}}  {row.protocol}"
@@ -248,6 +252,12 @@ def main(arguments: list[str] | None = None) -> int:
         return INTERRUPTED
     say(format_table(rows))
     return 0
+
+
+def _shown(value: float | int | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:d}" if isinstance(value, int) else f"{value:.6f}"
 
 
 def _columns(path: Path) -> int:
