@@ -10,21 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import maps
 from compilations import compilations
 from mipsjax import recovery, schedule, slam
 from mipsjax.bundle import rested
 from mipsjax.config import Config, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
+from mipsjax.core import mapping
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
 from mipsjax.links import linked_pairs, links
-from mipsjax.policy import Status
+from mipsjax.policy import NEW, Status
 from mipsjax.presets import PRESETS
 from mipsjax.reconstruct import reconstruct
 from mipsjax.state import SlamState, Submap, distance, trajectory, world_pose
 from mipsjax.surfaces import pair_of, plane_factor
-from mipsjax.territory import Sighting
+from mipsjax.territory import Sighting, enter
 
 CFG = replace(
     PRESETS["tiny"],
@@ -93,6 +95,18 @@ def test_a_new_submap_counts_from_its_anchor(states):
     assert max(numbers) == numbers[0] == len(begun.records) - 1
     following = states[len(begun.records)].records[-1]
     assert following.keyframe == 0 and not following.info.keyframe
+
+
+def test_support_is_what_was_seen_last():
+    """Also where the submap before has few keyframes of its own yet, behind the support that it was begun with."""
+    cfg = replace(PRESETS["tiny"], volume=VolumeConfig(support=3))
+    numbers = (50, 40, 30, 20, 51, 60)
+    keyframes = (maps.keyframe(n, maps.pose(translation=(n / 100 - 0.5, 0.0, 0.0))) for n in numbers)
+    old = maps.submap(*keyframes, learned=mapping.create(jax.random.key(0), cfg))
+    begun = enter(maps.state(old), NEW, cfg).submap
+    assert [keyframe.number for keyframe in begun.keyframes] == [60, 51, 50, 40]
+    shifts = [keyframe.T_sub_cam[0, 3] for keyframe in begun.keyframes]
+    np.testing.assert_allclose(shifts, [0.0, -0.09, -0.1, -0.2], atol=1e-9)
 
 
 def test_no_pose_jumps_where_the_submap_changes(states, truth):
