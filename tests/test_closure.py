@@ -93,10 +93,22 @@ def test_a_frame_that_began_a_submap_stays_where_it_was_tracked(ring):
     wrong = given.with_submap(
         1, keyframes=(*given.submaps[1].keyframes, keyframe(number, pose((0.0, 80.0, 0.0))))
     )
-    records = [given.records[0]._replace(submap=4 if n == number else COUNT - 1) for n in range(201)]
-    wrong = wrong._replace(records=tuple(records))
-    after = without_rejected(wrong, {(1, 3): 0.0, (1, 4): 0.0})
+    after = without_rejected(tracked_in(wrong, 3, 4, since=number), {(1, 3): 0.0, (1, 4): 0.0})
     assert [s.keyframes for s in after.submaps] == [s.keyframes for s in given.submaps]
+
+
+def test_a_frame_with_which_an_old_submap_took_over_stays_where_it_was_tracked(ring):
+    given, _ = ring
+    tied = closing(given, 3, 5, 200, np.eye(4), np.eye(4))
+    wrong = tied.with_submap(1, keyframes=(*tied.submaps[1].keyframes, keyframe(200, pose((0.0, 80.0, 0.0)))))
+    after = without_rejected(tracked_in(wrong, 5, 3, since=200), {(1, 3): 0.0, (1, 5): 0.0})
+    assert [s.keyframes for s in after.submaps] == [s.keyframes for s in tied.submaps]
+
+
+def tracked_in(given: SlamState, before: int, after: int, since: int) -> SlamState:
+    """With 201 frames, which hang on one submap, and since one of them on another."""
+    records = (given.records[0]._replace(submap=after if n >= since else before) for n in range(201))
+    return given._replace(records=tuple(records))
 
 
 def test_a_loop_that_was_not_judged_is_forgotten(ring, monkeypatch):

@@ -120,10 +120,10 @@ def refine_together(
         *zip([awake(s.learned) for s in submaps], frames, keys, strict=True),
     )
     learned, views, keys_ = stack
-    shares = jnp.full(len(submaps), rate, jnp.float32)
+    network_rates = jnp.full(len(submaps), rate, jnp.float32)
     at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
     learned, poses, _ = mapping.refine_stack(
-        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, shares, at_once
+        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, network_rates, at_once
     )
     learned = jax.device_get(learned)  # and back to the first device, whatever refined it
     refined = []

@@ -151,16 +151,11 @@ def without_rejected(state: SlamState, weights: dict[tuple[int, int], float]) ->
             continue
         for shared in links(state.submaps[j], state.submaps[k]):
             number = shared.first.number
-            for place in {j, k} - _tracked_in(state, number):
+            # Where it was tracked, as the frame before it, and where it hangs, if another submap took over with it
+            own = {record.submap for record in state.records[max(number - 1, 0) : number + 1]}
+            for place in {j, k} - own:
                 state = unlinked(state, place, number)
     return state
-
-
-def _tracked_in(state: SlamState, number: int) -> set[int | None]:
-    """The submap that a frame hangs on, and the one before where a new submap was begun with it."""
-    place = state.records[number].submap
-    submap = state.submaps[place]
-    return {place, submap.parent} if submap.keyframes[0].number == number else {place}
 
 
 def _agrees(state: SlamState, place: int, cfg: Config) -> bool:

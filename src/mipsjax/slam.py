@@ -153,7 +153,7 @@ def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.
 
 
 def _views(state: SlamState, cfg: Config) -> Views:
-    """Keyframes near the last pose, spread evenly from the anchor, or the oldest after it, to the newest."""
+    """Keyframes near the last pose, spread evenly over their list, which begins with the anchor."""
     last, go = last_pose(state), cfg.track.go
     submap = state.submap
     near = [

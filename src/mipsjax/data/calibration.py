@@ -60,7 +60,7 @@ class Calibration:
 
 
 class Options(NamedTuple):
-    """What the user says about a sequence, also in `camera.json`; None for what the layout knows."""
+    """What the user says about a sequence, the first three also in `camera.json`; None for what the layout knows."""
 
     intrinsics: Calibration | None = None
     depth_scale: DepthScale | None = None

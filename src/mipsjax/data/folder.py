@@ -55,7 +55,7 @@ def read(path: Path, options: Options) -> ImageSequence:
         timestamps=numbered_times(keys, fps),
         T_world_cam=poses,
         calibration=options.intrinsics,
-        depth_scale=options.depth_scale or MILLIMETRES,
+        depth_scale=options.depth_scale or MILLIMETRES._replace(source="an assumption"),
         input=options.input,
         notes=notes,
     )

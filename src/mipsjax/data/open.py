@@ -94,8 +94,9 @@ def open_sequence(
             raise ConfigError(f"--layout {name}: unknown, choose one of {', '.join(LAYOUTS)}")
         sequence = _select(LAYOUTS[name].read(place, options), frames)
     except OSError as error:
+        hint = "; make it readable, as by chmod -R u+rX" if isinstance(error, PermissionError) else ""
         what, why = error.filename or place, error.strerror or error
-        raise InputError(f"{what}: cannot be read ({why}); make it readable, as by chmod -R u+rX") from error
+        raise InputError(f"{what}: cannot be read ({why}){hint}") from error
     return sequence.with_notes(check_depth_scale(sequence))
 
 

@@ -78,17 +78,18 @@ def _camera(path: Path, options: Options) -> tuple[Calibration, DepthScale, tupl
     """Intrinsics, depth scale and remarks; the file is looked at only for what the options leave open."""
     if options.intrinsics and options.depth_scale:
         return options.intrinsics, options.depth_scale, ()
-    calibration, scale, notes = _camera_params(path)
+    calibration, scale, notes = _camera_params(path, options)
     return options.intrinsics or calibration, options.depth_scale or scale, notes
 
 
-def _camera_params(path: Path) -> tuple[Calibration, DepthScale, tuple[str, ...]]:
+def _camera_params(path: Path, options: Options) -> tuple[Calibration, DepthScale, tuple[str, ...]]:
     """Intrinsics, depth scale and remarks, from the folder or the one above it."""
     places = (path / _CAMERA_FILE, path.parent / _CAMERA_FILE)
     file = next((place for place in places if place.is_file()), None)
     if file is None:
-        note = f"no {_CAMERA_FILE}: camera and depth scale of {PUBLISHED.source} assumed"
-        return PUBLISHED, DEPTH_SCALE, (note,)
+        wanted = {"camera": options.intrinsics, "depth scale": options.depth_scale}
+        missing = " and ".join(name for name, known in wanted.items() if known is None)
+        return PUBLISHED, DEPTH_SCALE, (f"no {_CAMERA_FILE}: {missing} of {PUBLISHED.source} assumed",)
     content = read_json(file)
     camera = content.get("camera", content)
     if not isinstance(camera, dict):
