@@ -134,7 +134,8 @@ def trajectory_rows(pair: Matched, absolute: metrics.AbsoluteError, delta_frames
             Row("rpe_rot_deg", relative.rot_rmse_deg, rpe),
         ]
     except InputError as error:
-        rows += [Row(name, None, str(error)) for name in ("rpe_trans_m", "rpe_rot_deg")]
+        reason = f"{error}, or choose a --delta at which there are true poses"
+        rows += [Row(name, None, reason) for name in ("rpe_trans_m", "rpe_rot_deg")]
     te = metrics.translation_error(pair.T_world_cam, pair.T_truth_cam)
     return [*rows, Row("te_mean_m", te.mean_m, "both seen from their first frame, no alignment, mean")]
 

@@ -134,8 +134,7 @@ def relative_error(T_world_cam: Poses, T_truth_cam: Poses, delta_frames: int = 1
     usable, _, _ = _usable(T_world_cam, T_truth_cam)
     complete = usable[:-delta_frames] & usable[delta_frames:]
     starts = np.flatnonzero(complete)
-    hint = "or choose an interval (--delta) at which there are true poses"
-    _require(len(starts), 1, f"RPE over {delta_frames} frames", hint)
+    _require(len(starts), 1, f"RPE over {delta_frames} frames")
     motion = _motions(T_world_cam, starts, delta_frames)
     true_motion = _motions(T_truth_cam, starts, delta_frames)
     error = _inverse(true_motion) @ motion
@@ -194,11 +193,11 @@ def _usable(T_world_cam: Poses, T_truth_cam: Poses) -> tuple[Bool[np.ndarray, "N
     return has_estimate & has_truth, int((~has_truth).sum()), int((has_truth & ~has_estimate).sum())
 
 
-def _require(found: int, needed: int, measure: str, hint: str = "") -> None:
+def _require(found: int, needed: int, measure: str) -> None:
     if found < needed:
         raise InputError(
             f"{measure} needs at least {needed} finite pairs of estimated and true poses, found {found}: "
-            f"check that both trajectories cover the same time {hint}".strip()
+            "check that both trajectories cover the same time"
         )
 
 
