@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from common import changed, show, use_compilation_cache, write_rows
+from common import changed, show, write_rows
 from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking
 from mipsjax.data.open import open_sequence
@@ -86,7 +87,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--encodings", nargs="*", default=["both"])
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     sequence = open_sequence("synth:room")
     rows = []
     for encoding in options.encodings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import resource
 import time
 from collections import Counter
@@ -11,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from mipsjax import slam
@@ -23,7 +23,8 @@ from mipsjax.final import finish
 from mipsjax.host.metrics import absolute_error, relative_error
 from mipsjax.state import Pose, SlamState, keyframes, map_bytes, trajectory
 
-DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("MIPSJAX_DATA", ROOT.parent / "shared" / "data"))  # real sequences
 OUT = Path(__file__).resolve().parent / "out"
 WARM_UP = 5  # frames after which the clock starts: by then everything is compiled
 RATE = 30.0  # frames a second
@@ -144,9 +145,3 @@ def show(row: Mapping[str, Any]) -> None:
     print(
         "  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True
     )
-
-
-def use_compilation_cache() -> None:
-    """Compile each graph once over all experiments. Set TF_CPP_MIN_LOG_LEVEL=3 against its chatter."""
-    jax.config.update("jax_compilation_cache_dir", str(OUT / "cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

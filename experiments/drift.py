@@ -20,9 +20,10 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from common import changed, show, use_compilation_cache, write_rows
+from common import changed, show, write_rows
 from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
 from mipsjax.closure import recognise, solve
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import mapping, volume
 from mipsjax.data.open import open_sequence
@@ -148,7 +149,7 @@ def main() -> None:
     parser.add_argument("--false", type=int, nargs="*", default=[0, 3])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     cfg, rows = changed(Config(), "loop", apart=2), []
     sequence = open_sequence("synth:apartment")
     for count in options.counts:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import argparse
 
-from common import changed, run, show, use_compilation_cache, write_rows
+from common import changed, run, show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from surface import surface_row
 from tracking import kitchen
@@ -29,7 +30,7 @@ def main() -> None:
     parser.add_argument("--rooms", nargs="*", default=list(ROOMS))
     parser.add_argument("--name", default="encodings", help="of the table")
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     rows = []
     for encoding in options.encodings:
         cfg = changed(Config(), "field", encoding=encoding)

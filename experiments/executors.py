@@ -23,9 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import changed, show, use_compilation_cache, write_rows
+from common import changed, show, write_rows
 from mipsjax import slam
 from mipsjax.bundle import mapping_camera
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import mapping
 from mipsjax.data.open import open_sequence
@@ -47,7 +48,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--stacks-only", action="store_true")
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     if not options.stacks_only:
         executors(options.frames, options.repeats)
     stacks(options.stacks_only)

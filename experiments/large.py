@@ -26,7 +26,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
 
-from common import DATA, OUT, Run, changed, run, show, use_compilation_cache, write_rows
+from common import DATA, OUT, Run, changed, run, show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import volume
 from mipsjax.data.open import open_sequence
@@ -151,7 +152,7 @@ def main() -> None:
     parser.add_argument("--no-surface", action="store_true", help="leaves accuracy and seams out")
     parser.add_argument("--out", default="large", help="name of the CSV files")
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     OUT.mkdir(exist_ok=True)
     rows, memory = [], []
     for name, seed, switch in (

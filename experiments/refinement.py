@@ -14,8 +14,9 @@ import argparse
 import jax.numpy as jnp
 import numpy as np
 
-from common import run, show, use_compilation_cache, write_rows
+from common import run, show, write_rows
 from mipsjax.bundle import mapping_stride
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core.mapping import Learned
@@ -63,7 +64,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=420)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     rows = []
     for seed in options.seeds:
         left, online = Left(), []

@@ -18,7 +18,8 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from common import OUT, follow, show, use_compilation_cache, write_rows
+from common import OUT, follow, show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core.volume import moved
 from mipsjax.data.open import open_sequence
@@ -60,7 +61,7 @@ def main() -> None:
     parser.add_argument("--name", default="apartment+noise")
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     rows = []
     for case in options.cases:
         for seed in options.seeds:

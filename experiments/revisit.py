@@ -21,8 +21,9 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 
-from common import OUT, changed, follow, show, use_compilation_cache, write_rows
+from common import OUT, changed, follow, show, write_rows
 from mipsjax import territory
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.host.metrics import absolute_error
@@ -56,7 +57,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     count = len(options.variants)
     figure, axes = plt.subplots(count, 1, figsize=(9, 2.2 * count), sharex=True, sharey=True, squeeze=False)
     rows = []

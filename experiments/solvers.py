@@ -23,7 +23,8 @@ import numpy as np
 import optimistix as optx
 
 from basin import DONE_M, DONE_RAD, fitted
-from common import show, use_compilation_cache, write_rows
+from common import show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import tracking
@@ -87,7 +88,7 @@ def main() -> None:
     )
     parser.add_argument("--starts", type=int, default=100)
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     cfg, sequence = Config(), open_sequence("synth:room")
     submap, poses = fitted(sequence, cfg)
     rng = np.random.default_rng(cfg.seed)

@@ -15,7 +15,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from common import OUT, Run, run, show, use_compilation_cache, write_rows
+from common import OUT, Run, run, show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth.mesh import reference_mesh
@@ -64,7 +65,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--names", nargs="*", default=["room", "room+noise"])
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     OUT.mkdir(exist_ok=True)
     rows = []
     for name in options.names:

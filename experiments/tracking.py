@@ -11,7 +11,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from common import DATA, changed, run, show, use_compilation_cache, write_rows
+from common import DATA, changed, run, show, write_rows
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.presets import preset
 
@@ -34,7 +35,7 @@ def main() -> None:
     parser.add_argument("--stop", type=int, default=1000, help="frames of the kitchen")
     parser.add_argument("--name", default="tracking", help="of the table")
     options = parser.parse_args()
-    use_compilation_cache()
+    enable_cache()
     cfg = preset(options.preset)
     rows = []
 

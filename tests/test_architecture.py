@@ -16,7 +16,7 @@ ROOT = Path(mipsjax.__file__).parent
 
 # From the left; a module imports only from layers before its own, and from its own package.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "config", "config_submaps", "files"}),
+    frozenset({"errors", "config", "config_submaps", "files", "compilation"}),
     frozenset({"presets"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),

@@ -105,7 +105,7 @@ class MapConfig:
 
     steps: int = 32
     """Each frame of a fast camera, once a submap is initialised (paper: 15 in one place, 10 in another, always)."""
-    steps_slow: int = 12
+    steps_slow: int = 8
     """The same where the camera has hardly moved since the last frame; in between, in proportion to the motion."""
     motion: float = 0.1
     """Metres (or as many times 1 rad) of motion between frames that deserve all `steps`."""

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
+import ctypes
 import logging
 import os
-import platform
 import signal
 import sys
 import tempfile
 import traceback
-import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
 from typing import Any
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
 from mipsjax import outputs, slam
 from mipsjax.commandline import Options, parse, say
+from mipsjax.compilation import enable_cache
 from mipsjax.config import Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
 from mipsjax.data.sequence import Sequence
@@ -43,8 +40,6 @@ LINE_EVERY = 50
 """Frames between two lines of progress where there is no terminal."""
 MIN_USABLE = 2
 """Frames that make a sequence."""
-CACHE_FROM_S = 0.3
-"""Compilations that take less are not worth a file."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -97,27 +92,6 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
     return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end, finish_s)
 
 
-def enable_cache() -> None:
-    """Lets JAX keep compiled programs in the user's cache folder; without a folder it does without.
-
-    A cache that the user has chosen (JAX_COMPILATION_CACHE_DIR) stays.
-    """
-    # A damaged entry is compiled anew: nothing that a user must know
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
-    if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(home) / "mipsjax" / f"xla-{version('jaxlib')}-{_processor()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", CACHE_FROM_S)
-
-
 def _run(options: Options) -> int:
     """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
     cfg, tell = options.settings, _teller(options.quiet)
@@ -133,12 +107,19 @@ def _run(options: Options) -> int:
             run = travel(sequence, cfg, stop, tell_status)
         if run.state is None:
             raise _nothing_usable(run)
+        _return_memory()
         began = perf_counter()
         mesh = None if options.no_mesh else reconstruct(run.state, cfg)
         seconds = {"open": opened_s, "mesh": perf_counter() - began}
         content = outputs.write_results(folder, run, mesh, seconds, remarks)
         tell(_summary(content))
         return _exit_code(run, folder)
+
+
+def _return_memory() -> None:
+    """Hands back what glibc keeps although nothing uses it: over 100 MB after tracking, and the mesh needs more."""
+    with suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _exit_code(run: Run, folder: Path) -> int:
@@ -316,18 +297,6 @@ def _bugs_saved_in(folder: Path) -> Iterator[None]:
         except OSError as failure:
             where = f"its traceback cannot be written ({failure.strerror})"
         raise _BugError(f"a bug of mipsjax, please report it: {text}; {where}") from error
-
-
-def _processor() -> str:
-    """A short name for this kind of processor: compiled programs are for one kind only."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-        kind = "\n".join(
-            sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-        )
-    except OSError:
-        kind = platform.processor()
-    return hashlib.sha256(f"{platform.machine()} {kind}".encode()).hexdigest()[:12]
 
 
 if __name__ == "__main__":
