@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mipsjax.config import Config, GuardConfig, KeyframeConfig, MapConfig, SearchConfig, TrackConfig
-from mipsjax.policy import NEW, STAY, FrameStats, Status, converged, decide, governor, widening
+from mipsjax.policy import NEW, STAY, Decision, FrameStats, Status, converged, decide, governor, widening
 
 CFG = Config(
     map=MapConfig(steps=10, steps_slow=4, motion=0.1),
@@ -19,6 +19,7 @@ CFG = Config(
 # An ordinary frame: all known, near the last keyframe, hardly moved
 PLAIN = FrameStats(
     finite=True,
+    measured=0.9,
     known=0.9,
     confirmed=0.8,
     residual=0.01,
@@ -74,6 +75,13 @@ def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
     noisy = PLAIN._replace(least_residual=0.02)
     assert decide(noisy._replace(residual=0.029), CFG).status is Status.OK
     assert decide(noisy._replace(residual=0.031), CFG).status is Status.LOST
+
+
+def test_a_frame_with_hardly_any_depth_is_weak_and_teaches_nothing():
+    few = PLAIN._replace(measured=0.049, translation=9.0)
+    assert decide(few, CFG) == Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0)
+    assert decide(few._replace(known=0.1), CFG).status is Status.LOST
+    assert decide(few._replace(measured=0.051), CFG).status is Status.OK
 
 
 @pytest.mark.parametrize(

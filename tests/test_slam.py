@@ -189,6 +189,25 @@ def test_which_frame_can_begin_a_map(frames, frame, problem):
     assert slam.anchor_problem(frames[0]._replace(**frame)) == problem
 
 
+@pytest.mark.parametrize("nonsense", [np.nan, np.inf, -np.inf, -1.0])
+def test_depth_that_is_no_distance_is_none(finished, frames, nonsense):
+    hole = np.s_[10:30, 10:40]
+
+    def after(value: float):
+        depth = frames[-1].depth.copy()
+        depth[hole] = value
+        frame = frames[-1]._replace(depth=depth)
+        begun = slam.start(frame, finished.camera, CFG)
+        return begun, slam.step(begun, following(frame), CFG)
+
+    for state, expected in zip(after(nonsense), after(0.0), strict=True):
+        np.testing.assert_array_equal(trajectory(state), trajectory(expected))
+        for mine, other in zip(
+            jax.tree.leaves(state.submap.learned), jax.tree.leaves(expected.submap.learned), strict=True
+        ):
+            np.testing.assert_array_equal(mine, other)
+
+
 def test_finish_without_steps_changes_nothing(finished):
     cfg = replace(CFG, map=replace(CFG.map, final_steps=0))
     go = replace(cfg.track.go, final_steps=0)

@@ -128,6 +128,7 @@ RANGES: dict[str, Range] = {
     "guard.weak": SHARE,
     "guard.lost": SHARE,
     "guard.confirmed": SHARE,
+    "guard.measured": SHARE,
     "guard.residual": SWITCH,
     "guard.residual_unsure": SWITCH,
     "guard.noise": POSITIVE,

@@ -26,6 +26,8 @@ class FrameStats(NamedTuple):
     """What is known of a tracked frame."""
 
     finite: bool
+    measured: float
+    """Share of pixels with depth, 0..1."""
     known: float
     """Share of measured pixels within KeyframeConfig.error of the mapped surface, 0..1."""
     confirmed: float
@@ -63,6 +65,8 @@ def decide(stats: FrameStats, cfg: Config) -> Decision:
     status = _status(stats, cfg)
     if status is Status.LOST:
         return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0)
+    if stats.measured < cfg.guard.measured:
+        return Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0)
     share = _motion_share(stats, cfg)
     return Decision(
         status,

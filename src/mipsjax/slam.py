@@ -54,7 +54,7 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     `T_world_sub` is the pose of that frame in the world, the identity if none is given.
     """
     began = perf_counter()
-    anchor = _keyframe(frame, 0, np.eye(4), cfg, camera)
+    anchor = _keyframe(frame.cleaned(), 0, np.eye(4), cfg, camera)
     T_world_sub = np.eye(4) if T_world_sub is None else T_world_sub
     submap, ok = begin(anchor, [], T_world_sub, cfg.map.first_steps, camera, cfg)
     info = FrameInfo(
@@ -68,6 +68,7 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
 
 def anchor_problem(frame: Frame) -> str:
     """Why a frame cannot begin a map, or a submap that hangs on nothing; empty if it can."""
+    frame = frame.cleaned()
     if frame.color is None or frame.depth is None:
         return frame.problem or "no image"
     measured = float(np.mean(frame.depth > 0))
@@ -79,12 +80,13 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
 
     `executor` refines inactive submaps meanwhile; what comes out is the same to the bit with any (`schedule.py`).
     """
+    frame = frame.cleaned()
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
     began = perf_counter()
     T_sub_cam, info = _track(state, frame, cfg)
     track_ms = _ms(began)
-    stats = _stats(state, T_sub_cam, info)
+    stats = _stats(state, frame.depth, T_sub_cam, info)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}, residual {1e3 * stats.residual:.0f} mm"
@@ -266,12 +268,13 @@ def _scaled(motion: Pose, ratio: float) -> Pose:
     return scaled
 
 
-def _stats(state: SlamState, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:
+def _stats(state: SlamState, depth: np.ndarray, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:
     keyframe, last = state.submap.keyframes[state.submap.newest], last_pose(state)
     translation, rotation = distance(keyframe.T_sub_cam, T_sub_cam)
     step_translation, step_rotation = distance(last, T_sub_cam)
     return FrameStats(
         finite=bool(info.ok),
+        measured=float(np.mean(depth > 0)),
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
         residual=float(info.after.residual),

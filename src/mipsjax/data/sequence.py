@@ -24,6 +24,12 @@ class Frame(NamedTuple):
     problem: str = ""
     """Why colour or depth is None, in one line; empty for a whole frame."""
 
+    def cleaned(self) -> Frame:
+        """With 0 where the depth is no distance: NaN, infinite or negative."""
+        if self.depth is None:
+            return self
+        return self._replace(depth=np.where(np.isfinite(self.depth) & (self.depth > 0), self.depth, 0))
+
 
 @runtime_checkable
 class Sequence(Protocol):
