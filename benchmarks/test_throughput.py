@@ -16,6 +16,7 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import mapping, particles, tracking
 from mipsjax.core.camera import Intrinsics, grid_shape
+from mipsjax.core.views import Views
 from mipsjax.presets import PRESETS
 
 CAMERA = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
@@ -31,7 +32,7 @@ def wall(camera: Intrinsics, frames: int) -> mapping.Frames:
     )
     color = np.full((frames, camera.height, camera.width, 3), 128, np.uint8)
     poses = np.broadcast_to(np.eye(4, dtype=np.float32), (frames, 4, 4))
-    return mapping.Frames(np.stack([depth] * frames), color, poses, np.arange(frames) > 0)
+    return mapping.Frames(np.tile(depth, (frames, 1, 1)), color, poses, np.arange(frames) > 0)
 
 
 def pixels_of(wanted: int, camera: Intrinsics) -> int:
@@ -80,15 +81,19 @@ def test_track(throughput, name):
     frame = wall(CAMERA, 1)
     start = np.eye(4, dtype=np.float32)
     start[:3, 3] = 0.005
+    keyframes = wall(small(cfg), cfg.track.go.views)
+    views = Views(keyframes.depth, keyframes.T_sub_cam)
+    ro, go = cfg.track.ro, cfg.track.go
     args = (field, frame.depth[0], frame.color[0], np.stack([start, start]), np.float32(1), KEY)
+    more = (views, np.float32(ro.residual))
 
     def run(*args):
-        return tracking.track(*args, CAMERA, cfg)
+        return tracking.track(*args, CAMERA, cfg, *more)
 
     searched = bool(run(*args)[1].searched)
-    ro, go = cfg.track.ro, cfg.track.go
-    steps = go.steps + (go.smooth_steps if go.method == "lm" and cfg.field.encoding == "both" else 0)
-    points = steps * pixels_of(go.pixels, CAMERA)
+    points = go.steps * pixels_of(go.pixels, CAMERA)
+    if go.method == "lm" and cfg.field.encoding == "both":
+        points += go.smooth_steps * pixels_of(go.smooth_pixels, CAMERA)
     points += searched * ro.steps * ro.particles * pixels_of(ro.pixels, CAMERA)
     throughput(points, matrix_flops(run, *args, searched=searched), run, *args)
 

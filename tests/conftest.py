@@ -1,9 +1,12 @@
-"""Shared by all tests: strict JAX, a compilation cache, fixed hypothesis draws, real sequences."""
+"""Shared by all tests: strict JAX, a compilation cache, fixed hypothesis draws, sequences."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+# The same bits twice are promised on a CPU only. JAX reads this once, when it is first imported.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import pytest
@@ -33,3 +36,11 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real sequences at {folder}; set MIPSJAX_DATA")
     return folder
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`synth:tiny` in the TUM layout, once for all modules."""
+    import running  # here, since it loads the whole program
+
+    return running.export(tmp_path_factory.mktemp("exported") / "tiny")

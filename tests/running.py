@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import math
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +14,13 @@ import cv2
 import jax
 import numpy as np
 import pytest
+import trimesh
 
 from mipsjax.config import InputConfig
 from mipsjax.data.synth import open_synth
 from mipsjax.data.synth.export import export_tum
 from mipsjax.data.trajectory import known_poses, read_tum
+from mipsjax.policy import Status
 from mipsjax.run import main
 
 FRAMES = 12
@@ -55,23 +58,28 @@ class Program:
     def __call__(self, sequence: Path | str, *options: str, mesh: bool = False) -> Result:
         more = [] if mesh else ["--no-mesh"]
         more += [] if "--out" in options else ["--out", str(self.out)]
-        return self.plain(str(sequence), "--preset", "tiny", *more, *options)
+        before = contents(Path(sequence))
+        result = self.plain(str(sequence), "--preset", "tiny", *more, *options)
+        assert contents(Path(sequence)) == before, "the input was written to"
+        return result
 
     def plain(self, *arguments: str) -> Result:
         """Without any option of its own."""
         self._capsys.readouterr()
+        out = Path(arguments[arguments.index("--out") + 1]) if "--out" in arguments else self.out
+        before = hidden(out)
         with jax.numpy_rank_promotion("allow"):  # as users have it
             code = main(list(arguments))
         printed = self._capsys.readouterr()
-        out = Path(arguments[arguments.index("--out") + 1]) if "--out" in arguments else self.out
         assert "Traceback" not in printed.out + printed.err
         assert len(printed.err.strip().splitlines()) == (0 if code == 0 else 1), printed.err
         check_outputs(out)
+        assert hidden(out) <= before, "a lock or half a file is left"
         return Result(code, printed.out, printed.err, out)
 
 
 def check_outputs(out: Path) -> None:
-    """Whatever is there is whole, readable and finite, and nothing else is there."""
+    """Whatever is there is whole, readable and finite."""
     if not os.path.isdir(out):
         return
     if (out / "trajectory.txt").exists():
@@ -80,7 +88,31 @@ def check_outputs(out: Path) -> None:
     for path in out.glob("*.json*"):
         for line in [path.read_text()] if path.suffix == ".json" else path.read_text().splitlines():
             json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
-    assert not [path for path in out.glob(".*") if path.name != ".lock"]
+    if (out / "status.csv").exists():
+        check_status((out / "status.csv").read_text())
+    if (out / "mesh.ply").exists():
+        mesh = trimesh.load_mesh(out / "mesh.ply", process=False)
+        assert np.isfinite(mesh.vertices).all()
+
+
+def check_status(text: str) -> None:
+    """Of a `status.csv`: whole lines, finite numbers, and what is not known left empty."""
+    names, *rows = csv.reader(text.splitlines())
+    for row in rows:
+        cells = dict(zip(names, row, strict=True))
+        assert cells.pop("status") in set(Status)
+        assert (cells.pop("found") + cells.pop("note")).isprintable()
+        assert all(math.isfinite(float(cell)) for cell in cells.values() if cell)
+
+
+def hidden(folder: Path) -> set[Path]:
+    return set(folder.glob(".*")) if os.path.isdir(folder) else set()
+
+
+def contents(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Size and time of all that is in a folder; nothing for a built-in sequence."""
+    found = ((path, path.stat()) for path in folder.rglob("*"))
+    return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in found}
 
 
 @pytest.fixture
@@ -88,20 +120,16 @@ def program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Program:
     return Program(tmp_path, capsys)
 
 
-@pytest.fixture(scope="session")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`synth:tiny` in the TUM layout."""
-    folder = tmp_path_factory.mktemp("exported") / "tiny"
+def export(folder: Path) -> Path:
+    """Writes `synth:tiny` in the TUM layout."""
     export_tum(open_synth("tiny", slice(FRAMES), InputConfig()), folder, voxel_m=None)
     return folder
 
 
 @pytest.fixture
-def sequence(exported: Path, tmp_path: Path) -> Iterator[Path]:
-    """A copy of it to spoil; the run must not add to it."""
-    copy = tmp_path / "sequence"
-    shutil.copytree(exported, copy)
-    yield copy
+def sequence(exported: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return shutil.copytree(exported, tmp_path / "sequence")
 
 
 def image(folder: Path, kind: str, number: int) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import jax
@@ -12,8 +13,9 @@ from maps import keyframe, pose, state, submap
 from mipsjax import closure
 from mipsjax.closure import solve, without_rejected
 from mipsjax.core import mapping
+from mipsjax.outputs import loops_content
 from mipsjax.presets import PRESETS
-from mipsjax.state import SlamState, distance
+from mipsjax.state import Loop, SlamState, distance
 from mipsjax.territory import Sighting, link
 
 CFG = PRESETS["tiny"]
@@ -21,11 +23,14 @@ COUNT = 6
 STEP = pose((0.0, 360.0 / COUNT, 0.0), (2.0, 0.0, 1.0))
 """From one submap of a ring to the next."""
 DRIFT = pose((0.5, -0.5, 0.5), (0.03, 0.02, -0.02))
+T_LAST_CAM = pose((0.0, 5.0, 0.0), (0.1, 0.0, 0.1))
+"""Where frame 100, which closes the ring, is in the last submap."""
+ELSEWHERE = pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0))
 
 
 @pytest.fixture(scope="module")
-def ring() -> tuple[SlamState, list[np.ndarray]]:
-    """Six submaps whose chain drifts at every step, and the true poses. Frame 100 closes the ring exactly."""
+def chain() -> tuple[SlamState, list[np.ndarray]]:
+    """Six submaps, each tied to the next, that drift at every step, and the true poses; the first is the world."""
     learned = mapping.create(jax.random.key(0), CFG)
     truth, drifted = [np.eye(4)], [np.eye(4)]
     for _ in range(COUNT - 1):
@@ -36,10 +41,14 @@ def ring() -> tuple[SlamState, list[np.ndarray]]:
         shared = [keyframe(place + 1, STEP @ DRIFT)] if place < COUNT - 1 else []
         new = submap(keyframe(place), *shared, T_world_sub=drifted[place], learned=learned)
         made.append(new._replace(parent=place - 1 if place else None))
-    given = state(*made, active=COUNT - 1)
-    T_first_last = np.linalg.inv(truth[0]) @ truth[-1]
-    T_last_cam = pose((0.0, 5.0, 0.0), (0.1, 0.0, 0.1))
-    return closing(given, 0, COUNT - 1, 100, T_first_last @ T_last_cam, T_last_cam), truth
+    return state(*made, active=COUNT - 1), truth
+
+
+@pytest.fixture(scope="module")
+def ring(chain) -> tuple[SlamState, list[np.ndarray]]:
+    """The chain, and frame 100 that closes it exactly."""
+    given, truth = chain
+    return closing(given, 0, COUNT - 1, 100, truth[-1] @ T_LAST_CAM, T_LAST_CAM), truth
 
 
 def closing(given: SlamState, j: int, k: int, number: int, T_j_cam, T_k_cam) -> SlamState:
@@ -69,7 +78,7 @@ def test_a_loop_takes_the_drift_away(ring):
 
 def test_a_false_loop_is_rejected_and_the_true_one_kept(ring):
     given, truth = ring
-    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    wrong = closing(given, 1, 4, 200, ELSEWHERE, np.eye(4))
     solved, weights = solve(wrong, CFG)
     assert weights[0, COUNT - 1] == 1 and weights[1, 4] == 0
     assert off(solved, truth) < 0.1 * off(given, truth)
@@ -77,7 +86,7 @@ def test_a_false_loop_is_rejected_and_the_true_one_kept(ring):
 
 def test_shared_frames_of_a_rejected_pair_are_dropped_where_they_were_not_tracked(ring):
     given, _ = ring
-    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    wrong = closing(given, 1, 4, 200, ELSEWHERE, np.eye(4))
     tracked = [given.records[0]._replace(submap=4 if number == 200 else COUNT - 1) for number in range(201)]
     solved, weights = solve(wrong._replace(records=tuple(tracked)), CFG)
     kept = [[k.number for k in submap.keyframes] for submap in without_rejected(solved, weights).submaps]
@@ -124,10 +133,72 @@ def test_a_loop_that_was_not_judged_is_forgotten(ring, monkeypatch):
     assert [s.keyframes for s in after.submaps] == [s.keyframes for s in alone.submaps]
 
 
+@pytest.mark.parametrize("how", ["box", "features"])
+def test_a_loop_is_closed_and_written_down(chain, monkeypatch, how):
+    given, truth = chain
+    before, asked = arrived(given), []
+    found = Sighting(0, truth[-1] @ T_LAST_CAM, 0.9)
+
+    def recognise(state, keyframe, places, cfg) -> Sighting | None:
+        asked.append(places)
+        return found if how == "features" else None
+
+    monkeypatch.setattr(closure, "recognise", recognise)
+    if how == "box":
+        after = closure.close(link(before, before.submap.keyframes[-1], found), [found], before, CFG)
+    else:
+        after = closure.close(before, [], before, CFG)
+    assert asked == [[1, 2] if how == "box" else [0, 1, 2]], "where a first link would be a loop"
+    metres, radians = distance(given.submap.T_world_sub @ T_LAST_CAM, found.T_sub_cam)
+    (loop,) = after.loops
+    assert loop[:5] == (100, COUNT - 1, 0, how, 0.9) and loop.weight == 1
+    # A tenth of the drift is what the loop's own sigma leaves to the chain
+    assert (loop.correction_m, loop.correction_rad) == pytest.approx((metres, radians), rel=0.1)
+    assert off(after, truth) < 0.1 * off(given, truth)
+    (row,) = json.loads(json.dumps(loops_content(after)))["loops"]
+    assert row.pop("correction_cm") == pytest.approx(100 * metres, rel=0.1)
+    assert row.pop("correction_deg") == pytest.approx(np.degrees(radians), rel=0.1)
+    assert row == {
+        "index": 200,
+        "timestamp": 10.0,
+        "submaps": [COUNT - 1, 0],
+        "how": how,
+        "inliers": 0.9,
+        "weight": 1,
+    }
+
+
+def test_older_loops_are_judged_again(chain):
+    """One that was kept can turn out false. One that was rejected stays so, and one without frames what it was."""
+    given, truth = chain
+    wrong = closing(given, 1, 4, 50, ELSEWHERE, np.eye(4))
+    # Also in the next submap, where tracking would vouch for it, had it not made a loop
+    wrong = wrong.with_submap(3, keyframes=(*wrong.submaps[3].keyframes, keyframe(50, STEP @ DRIFT)))
+    kept = Loop(50, 4, 1, "box", 0.9, 0.0, 0.0, weight=1.0)
+    rejected = kept._replace(first=COUNT - 1, second=0, weight=0.0)
+    bare = kept._replace(first=COUNT - 1, second=2)
+    before = arrived(wrong._replace(loops=(kept, rejected, bare)))
+    found = Sighting(0, truth[-1] @ T_LAST_CAM, 0.9)
+    after = closure.close(link(before, before.submap.keyframes[-1], found), [found], before, CFG)
+    assert [row["weight"] for row in loops_content(after)["loops"]] == [0, 0, 1, 1]
+    assert [loop.frame for loop in after.loops] == [50, 50, 50, 100]
+    assert off(after, truth) < 0.1 * off(given, truth)
+    assert 50 not in {k.number for k in after.submaps[1].keyframes}
+
+
+def arrived(given: SlamState) -> SlamState:
+    """With frame 100 as the newest keyframe of the last submap; of every second frame of a sequence at 20 Hz."""
+    keyframes = (*given.submap.keyframes, keyframe(100, T_LAST_CAM))
+    hung = given.records[0]._replace(submap=given.active)
+    records = [hung._replace(frame=2 * n, timestamp=n / 10) for n in range(101)]
+    records[-1] = records[-1]._replace(keyframe=len(keyframes) - 1)
+    return given.with_submap(given.active, keyframes=keyframes)._replace(records=tuple(records))
+
+
 def test_neighbours_along_the_chain_are_never_rejected(ring):
     """However wrong: tracking had brought the camera there."""
     given, _ = ring
-    wrong = closing(given, 1, 3, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    wrong = closing(given, 1, 3, 200, ELSEWHERE, np.eye(4))
     _, weights = solve(wrong, CFG)
     assert weights[1, 3] == 1
 
@@ -135,7 +206,7 @@ def test_neighbours_along_the_chain_are_never_rejected(ring):
 def test_a_false_loop_is_no_neighbour_of_a_neighbour(ring):
     """Its frame is in the next submap too, which is near the one that it was wrongly found in."""
     given, truth = ring
-    wrong = closing(given, 1, 4, 200, pose((0.0, 80.0, 10.0), (2.0, 1.0, -1.0)), np.eye(4))
+    wrong = closing(given, 1, 4, 200, ELSEWHERE, np.eye(4))
     also = (*wrong.submaps[3].keyframes, keyframe(200, STEP @ DRIFT))
     wrong = wrong.with_submap(3, keyframes=also)
     solved, weights = solve(wrong, CFG, frozenset({200}))

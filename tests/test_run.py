@@ -19,12 +19,18 @@ from mipsjax.data.trajectory import read_tum
 from mipsjax.presets import preset
 from running import FRAMES, Program
 
-# Fixtures: as assignments, so that parameters of the same name are no redefinitions of an import
-exported, program, sequence = running.exported, running.program, running.sequence
+# A fixture: as an assignment, so that a parameter of the same name is no redefinition of an import
+program = running.program
 
 RESULTS = {
     "trajectory.txt", "trajectory_gt.txt", "mesh.ply", "mesh.png", "metrics.json", "config.json",
     "status.csv", "events.jsonl", "loops.json",
+}  # fmt: skip
+
+PUBLIC = {
+    "PRESETS", "Config", "ConfigError", "Frame", "InputError", "Intrinsics", "Learned", "MipsjaxError",
+    "OutputError", "Sequence", "SlamState", "Status", "Submap", "TrackingLostError", "finish", "fitness",
+    "open_sequence", "preset", "reconstruct_mesh", "refine", "start", "step", "track", "trajectory", "validate",
 }  # fmt: skip
 
 
@@ -157,7 +163,8 @@ def test_a_bug_is_one_line_and_a_saved_traceback(
 def test_importing_starts_no_device_and_loads_no_heavy_package() -> None:
     code = (
         "import sys, mipsjax; dir(mipsjax); mipsjax.__version__; mipsjax.Config; mipsjax.preset('tiny');"
-        "print([name for name in ('jax', 'gtsam', 'cv2', 'trimesh', 'tyro') if name in sys.modules]);"
+        "heavy = {'jax', 'gtsam', 'cv2', 'trimesh', 'skimage', 'matplotlib', 'tyro', 'viser'};"
+        "print(sorted(heavy & set(sys.modules)));"
         "mipsjax.start, mipsjax.track, mipsjax.refine, mipsjax.fitness;"
         "import jax._src.xla_bridge as bridge; print(bridge._backends)"
     )
@@ -166,7 +173,8 @@ def test_importing_starts_no_device_and_loads_no_heavy_package() -> None:
 
 
 def test_public_names_exist() -> None:
-    for name in mipsjax._PLACES:
+    assert mipsjax._PLACES.keys() == PUBLIC
+    for name in PUBLIC:
         assert getattr(mipsjax, name) is not None
     assert callable(mipsjax.reconstruct_mesh)
     with pytest.raises(AttributeError, match="nothing"):

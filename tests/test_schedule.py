@@ -19,13 +19,20 @@ def test_inline_does_a_job_when_it_is_asked_for():
 
 
 def test_a_thread_does_jobs_beside_the_caller_and_in_order():
+    done = []
+
+    def note(i: int) -> int:
+        time.sleep(0.01 * (3 - i))  # a job that did not wait for the one before it would overtake it
+        done.append((i, threading.get_ident()))
+        return i
+
     with executor("thread") as beside:
-        jobs = [Job(lambda i: (i, threading.get_ident()), (i,)) for i in range(3)]
+        jobs = [Job(note, (i,)) for i in range(3)]
         for job in jobs:
             beside.start(job)
-        results = [beside.result(job) for job in reversed(jobs)]
-    assert [i for i, _ in results] == [2, 1, 0]
-    threads = {thread for _, thread in results}
+        assert [beside.result(job) for job in reversed(jobs)] == [2, 1, 0]
+    assert [i for i, _ in done] == [0, 1, 2]
+    threads = {thread for _, thread in done}
     assert len(threads) == 1 and threading.get_ident() not in threads
 
 

@@ -16,7 +16,7 @@ from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
 from mipsjax.policy import Status
 from mipsjax.presets import PRESETS
-from mipsjax.state import SlamState, trajectory
+from mipsjax.state import Motion, SlamState, trajectory
 
 CFG = PRESETS["tiny"]
 FRAMES = 6
@@ -174,6 +174,68 @@ def test_the_motion_is_that_between_the_last_trusted_frames(finished, frames):
     np.testing.assert_allclose(finished.motion.T_older_newer, np.linalg.inv(poses[-2]) @ poses[-1], atol=1e-9)
     blind = slam.step(finished, frames[0]._replace(depth=None, problem="gone"), CFG)
     assert blind.motion is finished.motion, "nothing was learned about it"
+
+
+@pytest.mark.parametrize(
+    ("intervals", "steps"), [(1.0, 1.0), (2.5, 2.5), (100.0, 5.0), (0.0, 0.0), (-3.0, 0.0)]
+)
+def test_the_motion_goes_on_for_the_time_that_has_passed(finished, intervals, steps):
+    """At the same speed, but not over a long gap, and not backwards in time."""
+    motion = Motion(translated(0.02), 1 / 30)
+    state = finished._replace(motion=motion)
+    last = trajectory(finished)[-1]
+    now = finished.records[-1].timestamp + intervals / 30
+    moving, still = slam._candidates(state, now)
+    np.testing.assert_allclose(moving, last @ translated(0.02 * steps), atol=1e-9)
+    np.testing.assert_allclose(still, last, atol=1e-12)
+
+
+def translated(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_memory_grows_by_a_small_record_a_frame(finished, frames):
+    """100,000 frames in half a gigabyte: where the map stays, a frame adds a record alone, of less than 5 kB."""
+    after = slam.step(finished, following(frames[-1])._replace(color=None), CFG)
+    blind = slam.step(finished, following(frames[-1])._replace(depth=None, problem="gone"), CFG)
+    assert same_map(after, finished) and same_map(blind, finished)
+    assert after.records[-1].depth is not None and after.records[-1].depth.nbytes < 5000
+    assert blind.records[-1].depth is None
+
+
+def sized_down(name: str, **field) -> Config:
+    """A whole method at the sizes of a test."""
+    cfg = PRESETS[name]
+    mapping = replace(cfg.map, first_steps=60, steps=6, steps_slow=6, pixels=64)
+    ro = replace(cfg.track.ro, particles=128, pixels=48)
+    return replace(cfg, field=replace(cfg.field, **field), map=mapping, track=replace(cfg.track, ro=ro))
+
+
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        sized_down("default"),
+        sized_down("default", encoding="hash"),
+        sized_down("default", encoding="joint"),
+        sized_down("default", encoding="frequency", classification=False),
+    ],
+    ids=["default", "hash", "joint", "regression"],
+)
+def test_the_method_tracks_with_each_field(frames, sequence, cfg):
+    state = run(frames, sequence.intrinsics, cfg)
+    assert all(record.status is Status.OK for record in state.records)
+    truth = np.linalg.inv(sequence.T_world_cam[0]) @ sequence.T_world_cam
+    error = np.linalg.norm(trajectory(state)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert error.max() < 0.03  # as above
+
+
+def test_the_paper_preset_searches_and_learns_in_every_frame(frames, sequence):
+    """How far it gets is in docs/method.md (b): its two softmaxes in a row hardly learn."""
+    state = run(frames, sequence.intrinsics, sized_down("paper"))
+    assert all(r.info.searched and r.info.map_steps == 6 for r in state.records[1:])
+    assert np.isfinite(trajectory(state)).all()
 
 
 @pytest.mark.parametrize(

@@ -69,11 +69,20 @@ VIEWS = np.stack(
 )
 
 
+def rays(v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Direction of each pixel with z = 1, from the documented conventions alone."""
+    return np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+
+
+def unprojected(depth: np.ndarray, T_a_cam: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """What pixels of a depth image show, in frame a."""
+    return rays(v, u) * depth[v, u][..., None] @ T_a_cam[:3, :3].T + T_a_cam[:3, 3]
+
+
 def see(T_world_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H W, float32, metres) and colour (H W 3, uint8) from a pose."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
-    direction, origin = ray @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
+    direction, origin = rays(v, u) @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
     # A camera ray has z = 1, so that the ray's parameter is its z-depth
     to_walls = (WALLS - origin) / direction
     depth = np.where(to_walls > 0, to_walls, np.inf).min(-1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import planes
 import pytest
-from corner import CAMERA, CFG, VIEWS, WALLS, apart, pose, see
+from corner import CAMERA, CFG, VIEWS, WALLS, apart, pose, see, unprojected
 from planes import REGRESSED, TAU, UNCERTAIN, plane
 
 from mipsjax.core import mapping
@@ -138,12 +138,8 @@ def test_any_number_of_points_becomes_a_fixed_one(count):
 def measured(T_sub_cam: np.ndarray) -> np.ndarray:
     """Every other pixel of every other row of the views, in the submap's frame."""
     v, u = np.mgrid[: CAMERA.height : 2, : CAMERA.width : 2].reshape(2, -1)
-    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], -1)
-    parts = []
-    for T, T_world_cam in zip(T_sub_cam, VIEWS, strict=True):
-        p_cam = ray * see(T_world_cam)[0][v, u, None]
-        parts.append(p_cam @ T[:3, :3].T + T[:3, 3])
-    return np.concatenate(parts)
+    pairs = zip(T_sub_cam, VIEWS, strict=True)
+    return np.concatenate([unprojected(see(T_world_cam)[0], T, v, u) for T, T_world_cam in pairs])
 
 
 @pytest.fixture(scope="module")

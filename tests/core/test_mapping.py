@@ -159,11 +159,10 @@ def test_the_slope_of_the_surface_in_closed_form():
     turn = pose((10.0, -25.0, 0.0), (1.5, -1.0, 0.0))
     depth, _ = corner.see(turn)
     v, u = (a.ravel() for a in np.mgrid[4:92:7, 4:124:7])
-    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
-    hit = (ray * depth[v, u][:, None]) @ turn[:3, :3].T + turn[:3, 3]
+    hit = corner.unprojected(depth, turn, v, u)
     near_edge = np.sort(np.abs(hit - corner.WALLS), 1)[:, 1] < 0.2
     wall = np.abs(hit - corner.WALLS).argmin(1)
-    expected = np.abs((ray @ turn[:3, :3].T)[np.arange(len(u)), wall])
+    expected = np.abs((corner.rays(v, u) @ turn[:3, :3].T)[np.arange(len(u)), wall])
     slope = np.asarray(mapping.surface_slope(depth, v, u, CAMERA))
     plain = ~near_edge & (expected > 0.3)
     assert plain.sum() > 50

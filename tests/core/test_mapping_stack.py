@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mipsjax.compilation import enable_cache
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
 from mipsjax.presets import PRESETS
@@ -61,7 +62,7 @@ def test_a_stack_is_refined_as_one_by_one():
     stack, keys = stacked()
     at_once = together(stack, keys)
     assert farthest(at_once, stack[0]) > 1e-3, "nothing was learned"
-    assert farthest(at_once, one_by_one(stack, keys)) < 1e-6
+    assert farthest(at_once, one_by_one(stack, keys)) == 0
 
 
 def test_vmap_gives_the_same_but_for_rounding():
@@ -78,6 +79,7 @@ def test_vmap_gives_the_same_but_for_rounding():
 
 
 if __name__ == "__main__":
+    enable_cache()  # the same as that of the tests
     STACK, KEYS = stacked()
     AT_ONCE = together(STACK, KEYS)
     assert len(AT_ONCE.field.color.weights[0].sharding.device_set) == 2, "not on two devices"
@@ -86,9 +88,11 @@ if __name__ == "__main__":
 
 def test_two_devices_give_the_same():
     """In a process of its own: the number of devices is fixed when JAX starts."""
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    env = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
         [sys.executable, Path(__file__)], env=env, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    # None here; with more cores each device may divide its sums otherwise
     assert float(done.stdout) < 1e-6

@@ -124,13 +124,15 @@ def test_fitness_against_a_loop_over_poses_and_points(wall, plane_points, uncert
         assert float(cost) == pytest.approx(np.sum(weight * psi**2) / np.sum(weight), rel=1e-4, abs=1e-13)
 
 
-def test_fitness_does_not_depend_on_the_other_poses(wall, plane_points):
-    """However many there are, and so however they fall into chunks."""
+@pytest.mark.parametrize("chunk", [1, 64, 700])
+def test_fitness_does_not_depend_on_the_other_poses(wall, plane_points, monkeypatch, chunk):
+    """However many there are, and however they fall into chunks: each alone, with a rest, all in one."""
     poses = poses_around(TRUTH, 700)
+    alone = jnp.stack([particles.pose_cost(wall, T, plane_points, MASK, FIELD, SEARCH) for T in poses[::100]])
+    monkeypatch.setattr(particles, "CHUNK_POINTS", chunk * PIXELS)
     costs = particles.fitness(wall, poses, plane_points, MASK, FIELD, SEARCH)
-    for count in (1, 410):
-        part = particles.fitness(wall, poses[-count:], plane_points, MASK, FIELD, SEARCH)
-        np.testing.assert_allclose(part, costs[-count:], rtol=1e-5, atol=1e-13)
+    # Sums of 20 float32 numbers in another order, as above
+    np.testing.assert_allclose(costs[::100], alone, rtol=1e-5, atol=1e-13)
 
 
 def test_fitness_without_a_point_is_finite(wall, plane_points):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see
+from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see, unprojected
 
 from mipsjax.core import field as nf
 from mipsjax.core import tracking
@@ -30,8 +30,7 @@ def on_walls() -> np.ndarray:
     """Points of the three walls that the first view sees, away from the edges between them."""
     depth = see(HOME)[0]
     v, u = (x.ravel() for x in np.mgrid[8 : CAMERA.height - 8 : 7, 8 : CAMERA.width - 8 : 7])
-    ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], 1)
-    points = (ray * depth[v, u, None]) @ HOME[:3, :3].T + HOME[:3, 3]
+    points = unprojected(depth, HOME, v, u)
     clear = np.sort(np.abs(points - WALLS), axis=1)[:, 1] > 0.25
     return points[clear].astype(np.float32)
 

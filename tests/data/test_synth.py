@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -37,12 +36,6 @@ SMALL = Intrinsics(65.625, 65.625, 39.5, 29.5, 80, 60)
 distance = jax.jit(lambda scene, points: scene.distance(points))
 color_of = jax.jit(lambda scene, points: scene.color(points))
 normal = jax.jit(jax.vmap(jax.grad(lambda point, scene: scene.distance(point)), in_axes=(0, None)))
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks() -> Iterator[None]:
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 @lru_cache(maxsize=1)

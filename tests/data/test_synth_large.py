@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 
 import jax
@@ -36,12 +35,6 @@ distance = jax.jit(lambda scene, points: scene.distance(points))
 # Ranges without colour compile fast; the lights of one scene, so that all three share the compiled code
 traced = jax.jit(lambda scene, pose: trace(scene, pixel_rays(pose, jnp.array(SMALL[:4]), 48, 64)))
 color_of = jax.jit(lambda scene, points: scene.color(points))
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks() -> Iterator[None]:
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 @lru_cache(maxsize=3)
