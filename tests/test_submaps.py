@@ -196,7 +196,7 @@ def apart(state: SlamState) -> Pair:
 
 
 def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
-    """Across the surface, which here is hardly more than the floor; also from a shared frame that is 4 cm off."""
+    """Across the surface, which here is hardly more than a table top; also from a shared frame that is 4 cm off."""
     camera, pair = states[-1].camera, apart(states[-1])
     factor = plane_factor(pair, True, camera, CFG)
     assert factor is not None and len(factor.p_first) >= CFG.loop.fewest_points
