@@ -177,7 +177,7 @@ def test_a_second_run_gives_the_same_bits_and_compiles_nothing(states, frames, s
 def test_nothing_compiles_after_the_first_frames(frames, sequence):
     """Not when a submap begins or is entered again, nor when the graph is solved, here with every keyframe."""
     cfg = replace(CFG, loop=replace(CFG.loop, tolerance=1e-6))
-    # JAX keeps programs apart by this setting: none that another test has compiled is found under one of our own
+    # JAX keeps programs apart by this setting: under a value of our own none is found that another test compiled
     with jax.numpy_rank_promotion("warn"):
         state = slam.start(frames[0], sequence.intrinsics, cfg)
         for frame in frames[1:4]:
@@ -241,8 +241,8 @@ def moved(pair: Pair, metres: np.ndarray) -> Pair:
 
 def across(factor: PointToPlane, T_first_second: np.ndarray) -> float:
     """Median distance between matched points across the surface, metres."""
-    apart = factor.p_first - volume.moved(T_first_second, factor.q_second)
-    return float(np.median(np.abs(np.sum(apart * factor.n_first, axis=1))))
+    error = factor.p_first - volume.moved(T_first_second, factor.q_second)
+    return float(np.median(np.abs(np.sum(error * factor.n_first, axis=1))))
 
 
 def test_refinement_in_a_thread_gives_the_same_bits(states, frames, sequence):
