@@ -176,6 +176,18 @@ def test_the_motion_is_that_between_the_last_trusted_frames(finished, frames):
     assert blind.motion is finished.motion, "nothing was learned about it"
 
 
+def test_a_frame_with_hardly_any_depth_teaches_nothing(finished, frames):
+    """Neither the map, nor how well frames fit, nor how the camera moves."""
+    sparse = np.where(np.random.default_rng(0).random(frames[-1].depth.shape) < 0.03, frames[-1].depth, 0)
+    before = finished._replace(residual=1.0)
+    after = slam.step(before, following(frames[-1])._replace(depth=sparse), CFG)
+    record = after.records[-1]
+    assert record.status is Status.WEAK and record.info.map_steps == 0
+    assert record.info.note.startswith("depth in ") and record.info.note.endswith(" % of the pixels only")
+    assert same_map(after, finished) and after.trouble == 1
+    assert after.residual == before.residual and after.motion is before.motion
+
+
 @pytest.mark.parametrize(
     ("intervals", "steps"), [(1.0, 1.0), (2.5, 2.5), (100.0, 5.0), (0.0, 0.0), (-3.0, 0.0)]
 )

@@ -40,8 +40,8 @@ def enable_cache() -> None:
 def _machine() -> str:
     """A short name for this kind of processor and how many of its cores may be used.
 
-    Compiled programs are for one kind only, and divided among the cores of the process that compiled them: one that
-    comes from a process held to a single core is a third slower on two.
+    Compiled programs are for one kind only, and are divided among the cores of the process that compiled them: one
+    compiled by a process held to a single core is a third slower on two.
     """
     try:
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()

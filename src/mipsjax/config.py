@@ -235,8 +235,8 @@ class GuardConfig:
     """The same, of known pixels of which the map is certain: in space that was never observed everything looks like
     surface. Frames that are tracked well have 0.5 to 1."""
     measured: float = 0.05
-    """Share of pixels with depth below which a frame is weak, and nothing is learned from it: so few leave its pose
-    open."""
+    """Share of pixels with depth below which a frame that is not lost is weak, and nothing is learned from it: so few
+    pixels leave its pose open."""
     residual: float = 0.024
     """Metres; a frame with a larger residual is lost, if also `noise` times the least of late is less. Frames that are
     tracked well have at most 18 mm, another room 20 to 30."""

@@ -15,7 +15,7 @@ class Status(StrEnum):
 
     OK = "ok"
     WEAK = "weak"
-    """Mapped, but the next search is wider."""
+    """The next search is wider. Mapped, unless it has hardly any depth or was only found again."""
     LOST = "lost"
     """Not mapped; its pose is the last trusted one."""
     SKIPPED = "skipped"
@@ -58,21 +58,24 @@ class Decision(NamedTuple):
     map_steps: int
     pose_rate: float
     """Share of the pose learning rate in local bundle adjustment."""
+    tells: bool
+    """Its motion and residual say something about the frames to come."""
 
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
     status = _status(stats, cfg)
     if status is Status.LOST:
-        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0)
+        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
     if stats.measured < cfg.guard.measured:
-        return Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0)
+        return Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
     share = _motion_share(stats, cfg)
     return Decision(
         status,
         keyframe=_is_keyframe(stats, cfg),
         map_steps=round(_between(cfg.map.steps_slow, cfg.map.steps, share)),
         pose_rate=_between(cfg.map.pose_rate_slow, 1.0, share),
+        tells=True,
     )
 
 

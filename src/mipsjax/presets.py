@@ -21,7 +21,8 @@ from mipsjax.errors import ConfigError
 UNGUARDED = GuardConfig(
     weak=0.6, lost=0.4, confirmed=0.0, residual=float("inf"), residual_unsure=float("inf")
 )
-"""Judges a pose by its known pixels alone: the paper has no guard, and a map of `tiny` is certain of nothing."""
+"""Judges a pose by its pixels that are known, and that have depth, alone: the paper has no guard, and a map of `tiny`
+is certain of nothing."""
 
 PAPER = Config(
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),

@@ -72,7 +72,11 @@ def anchor_problem(frame: Frame) -> str:
     if frame.color is None or frame.depth is None:
         return frame.problem or "no image"
     measured = float(np.mean(frame.depth > 0))
-    return "" if measured >= ANCHOR_MEASURED else f"depth in {100 * measured:.1f} % of the pixels only"
+    return "" if measured >= ANCHOR_MEASURED else _few(measured)
+
+
+def _few(measured: float) -> str:
+    return f"depth in {100 * measured:.1f} % of the pixels only"
 
 
 def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLINE) -> SlamState:
@@ -91,8 +95,10 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     if decision.status is Status.LOST:
         note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}, residual {1e3 * stats.residual:.0f} mm"
         return _recover(taken_over(state, executor), frame, note, info, track_ms, cfg)
+    if not decision.tells:
+        frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
-    state = _moved_on(learned, state, float(info.after.residual))
+    state = _moved_on(learned, state, float(info.after.residual)) if decision.tells else learned
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
     return refine_inactive(state, cfg, executor)

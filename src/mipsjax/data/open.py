@@ -25,7 +25,8 @@ DEPTH_POSSIBLE_M = (0.05, 50.0)
 """No RGB-D camera gives a median outside: the depth scale must be wrong."""
 
 DEPTH_USUAL_M = (0.65, 6.0)
-"""A median outside is worth a remark: so is that of most rooms when it is wrong by a factor of five."""
+"""A median outside is worth a remark. So narrow that a room's falls outside where the scale is wrong by
+a factor of five."""
 
 USABLE_FRACTION = 0.01
 """A frame with fewer measurements than this says nothing about the depth scale."""
