@@ -65,10 +65,8 @@ class Decision(NamedTuple):
 def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
     status = _status(stats, cfg)
-    if status is Status.LOST:
+    if status is Status.LOST or _is_sparse(stats, cfg):
         return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
-    if stats.measured < cfg.guard.measured:
-        return Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
     share = _motion_share(stats, cfg)
     return Decision(
         status,
@@ -119,7 +117,11 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
-    return Status.WEAK if stats.known < guard.weak else Status.OK
+    return Status.WEAK if stats.known < guard.weak or _is_sparse(stats, cfg) else Status.OK
+
+
+def _is_sparse(stats: FrameStats, cfg: Config) -> bool:
+    return stats.measured < cfg.guard.measured
 
 
 def _is_keyframe(stats: FrameStats, cfg: Config) -> bool:
