@@ -1,7 +1,8 @@
 """Steps in a mesh where submaps meet, beside steps of the same size of cell where they do not.
 
 A mesh is off by a little everywhere, most where things are small or were far away, so that two parts of it are off by
-different amounts whether a border runs between them or not. A seam is what a border adds to that.
+different amounts whether a border runs between them or not. A seam is what a border adds to that. Two submaps that do
+not fit show it all along their border: so the median step of each border is given too.
 
 Only flat cells count: walls, floors, table tops, where a step would show. There the signed error of both sides is that
 of one plane; elsewhere each side may hold another part of a chair.
@@ -19,6 +20,7 @@ from mipsjax.data.synth.scene import Scene
 
 CELL = 0.25  # metres
 FEWEST = 20  # vertices on a side
+LEAST_BORDER = 5  # cells of a border whose median says something
 FLAT_M = 0.005  # the scene's surface in a flat cell is a plane up to this
 FLAT_NORMAL = 0.98  # least length of the mean of its normals
 CHUNK = 20_000
@@ -55,6 +57,7 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
     """
     rng = np.random.default_rng(0)
     steps: dict[str, list[float]] = {"seam": [], "control": []}
+    borders: dict[tuple[int, ...], list[float]] = {}
     foot = vertices - off.signed[:, None] * off.normal
     for members in _cells(vertices):
         if len(members) < 2 * FEWEST or not _flat(foot[members], off.normal[members]):
@@ -69,7 +72,12 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
             steps["control"].append(_step(order[:place], order[place:], off))
         elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
             steps["seam"].append(_step(*sides, off))
+            borders.setdefault(tuple(sorted(two.tolist())), []).append(steps["seam"][-1])
+    medians = [float(np.median(sizes)) for sizes in borders.values() if len(sizes) >= LEAST_BORDER]
     return {
+        "borders": len(medians),
+        "worst_border_median_cm": max(medians, default=float("nan")),
+    } | {
         f"{name}_{key}": value
         for name, sizes in steps.items()
         if sizes
