@@ -40,9 +40,8 @@ CFG = replace(
     map=replace(PRESETS["tiny"].map, steps=10, steps_slow=10),
 )
 FRAMES = 40  # 3.3 m
-TINY_MAP_M = 0.02  # two maps that have learned little disagree by up to 1.2 cm, by the rounding of the processor
-    0.02  # how well two maps that have learned little agree: 0.2 to 1.3 cm, by the processor's rounding
-)
+TINY_MAP_M = 0.02
+"""Maps that have learned little disagree by up to 1.2 cm, by the rounding of the processor."""
 
 
 @pytest.fixture(scope="module")
