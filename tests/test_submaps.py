@@ -40,8 +40,6 @@ CFG = replace(
     map=replace(PRESETS["tiny"].map, steps=10, steps_slow=10),
 )
 FRAMES = 40  # 3.3 m
-TINY_MAP_M = 0.02
-"""Maps that have learned little disagree by up to 1.2 cm, by the rounding of the processor."""
 
 
 @pytest.fixture(scope="module")
@@ -209,16 +207,20 @@ def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
     np.testing.assert_allclose(np.linalg.norm(factor.n_first, axis=1), 1, atol=1e-5)  # in single precision
 
     up = np.mean(factor.n_first, axis=0)
+    # Of two maps that have learned little the shared frame is up to 1.2 cm off: it starts from where surfaces meet
+    met = solve(np.stack([np.eye(4), pair.link.T_first_second]), [factor]).T_world_sub[1]
+    first, second = pair.link
+    pair = pair._replace(link=Link(first._replace(T_sub_cam=met @ second.T_sub_cam), second))
     for off in (0.0, 0.04):
         linked = moved(pair, off * up)
         T_linked = linked.link.T_first_second
         found = plane_factor(linked, True, camera, CFG)
-        assert found is not None and abs(across(found, T_linked) - off) < TINY_MAP_M
+        assert found is not None and abs(across(found, T_linked) - off) < CFG.loop.points_sigma
         assert len(found.p_first) > 0.9 * len(factor.p_first), "at the first pose fewer meet than at the last"
         T = solve(np.stack([np.eye(4), T_linked]), [pose_factor(linked, True, CFG), found]).T_world_sub[1]
         assert across(found, T) < CFG.loop.points_sigma
         # The shared frame was right: the surfaces agree with it, or take it back
-        assert abs(up @ (T - pair.link.T_first_second)[:3, 3]) < TINY_MAP_M
+        assert abs(up @ (T - pair.link.T_first_second)[:3, 3]) < CFG.loop.points_sigma
     # Of those that could meet, a third does: too few to believe, though enough to align the two
     assert plane_factor(moved(pair, 0.055 * up), True, camera, CFG) is None
 
