@@ -19,7 +19,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"presets"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
-    frozenset({"state"}),
+    frozenset({"state", "rest"}),
     frozenset({"bundle", "links"}),
     frozenset({"territory", "background", "surfaces"}),
     frozenset({"closure"}),

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import jax
 
-from mipsjax.bundle import BACKGROUND, choose, random_key, refine, refine_together, rested
+from mipsjax.bundle import BACKGROUND, choose, random_key, refine, refine_together
 from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
+from mipsjax.rest import rested
 from mipsjax.schedule import Executor, Job
 from mipsjax.state import Refinement, SlamState, Submap
 

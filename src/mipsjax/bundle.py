@@ -11,6 +11,7 @@ from mipsjax.config import Config
 from mipsjax.core import mapping, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
+from mipsjax.rest import awake
 from mipsjax.state import Keyframe, Pose, Submap, rigid
 
 # Purposes of random draws: a draw added in one place moves no other.
@@ -65,25 +66,6 @@ def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
     chosen = rng.choice(np.arange(1, count), min(others, count - 1), replace=False) if count > 1 else []
     picked = [0, *(int(i) for i in chosen)]
     return picked + [0] * (1 + others - len(picked))
-
-
-def rested(learned: mapping.Learned) -> mapping.Learned:
-    """With Adam's averages in half the bytes, as a submap is kept while the camera is elsewhere."""
-    return _cast(learned, np.float32, jnp.bfloat16)
-
-
-def awake(learned: mapping.Learned) -> mapping.Learned:
-    """With these in single precision again; one that does not rest is given back as it is."""
-    return _cast(learned, jnp.bfloat16, np.float32)
-
-
-def _cast(learned: mapping.Learned, old: type, new: type) -> mapping.Learned:
-    """On the host, where nothing is compiled for it."""
-
-    def cast(leaf):
-        return np.asarray(leaf).astype(new) if leaf.dtype == old else leaf
-
-    return learned._replace(optimizer=jax.tree.map(cast, learned.optimizer))
 
 
 def refine(

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mipsjax.background import taken_over
-from mipsjax.bundle import FINISH, MAP, adjust, random_key, rested
+from mipsjax.bundle import FINISH, MAP, adjust, random_key
 from mipsjax.config import Config
 from mipsjax.core import tracking
+from mipsjax.rest import rested
 from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import THUMBNAIL_UNIT, Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride
 

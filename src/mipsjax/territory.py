@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, MAP, adjust, awake, choose, mapping_camera, random_key, refine, rested
+from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.links import joined
 from mipsjax.policy import NEW, STAY, governor
+from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, inverse, rigid
 
 

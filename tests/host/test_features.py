@@ -6,7 +6,18 @@ import pytest
 
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.open import open_sequence
-from mipsjax.host.features import MAX_FEATURES, UNIT, VOTED, Features, detect, similar, squared_distances
+from mipsjax.host.features import (
+    LARGEST,
+    MAX_FEATURES,
+    UNIT,
+    VOTED,
+    Features,
+    detect,
+    packed,
+    similar,
+    squared_distances,
+    unpacked,
+)
 
 CAMERA = Intrinsics(290.0, 290.0, 159.5, 119.5, 320, 240)
 FLAT = np.full((240, 320), 2.0, np.float32)
@@ -30,34 +41,45 @@ def bits(found: Features) -> bytes:
 def looking(seed, count=100):
     """Features of a place of its own: unrelated descriptors."""
     d = np.abs(np.random.default_rng(seed).normal(size=(count, 128)))
-    d = np.minimum(np.rint(UNIT * d / np.linalg.norm(d, axis=1, keepdims=True)), 255).astype(np.uint8)
-    empty = np.zeros((count, 3), np.float32)
-    return Features(d, empty, empty[:, :2], np.zeros((30, 40), np.float32))
+    d = np.minimum(np.rint(UNIT * d / np.linalg.norm(d, axis=1, keepdims=True)), LARGEST).astype(np.uint8)
+    return Features(packed(d), np.zeros((count, 3), np.float32), np.zeros((30, 40), np.float32))
 
 
-def test_points_project_to_their_pixels():
-    depth = FLAT + np.linspace(0, 1, 320, dtype=np.float32)[None]
+def pixels(found: Features):
+    """(u, v) that the points project to."""
+    return found.p_cam[:, :2] / found.p_cam[:, 2:] * 290.0 + np.float32([159.5, 119.5])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_points_lie_where_the_depth_of_their_pixels_is(axis):
+    slope = np.linspace(0, 1, FLAT.shape[axis], dtype=np.float32)
+    depth = FLAT + (slope[None] if axis else slope[:, None])
     found = detect(picture(), depth, CAMERA)
     assert 100 < len(found.descriptors) <= MAX_FEATURES
-    assert len(found.p_cam) == len(found.pixel) == len(found.descriptors)
-    projected = found.p_cam[:, :2] / found.p_cam[:, 2:] * 290.0 + np.float32([159.5, 119.5])
-    np.testing.assert_allclose(projected, found.pixel, atol=1e-3)  # single precision of 320 pixels
-    u, v = np.rint(found.pixel).astype(int).T
+    assert len(found.p_cam) == len(found.descriptors)
+    u, v = np.rint(pixels(found)).astype(int).T
     # the median of the square around lies at most a pixel's slope from the middle
-    np.testing.assert_allclose(found.p_cam[:, 2], depth[v, u], atol=1.01 / 319)
+    np.testing.assert_allclose(found.p_cam[:, 2], depth[v, u], atol=1.01 / (len(slope) - 1))
 
 
 def test_descriptors_have_their_length():
     found = detect(picture(), FLAT, CAMERA)
-    length = np.linalg.norm(found.descriptors.astype(float), axis=1)
-    # rounding 128 components by up to a half, and components cut at 255
+    length = np.linalg.norm(unpacked(found.descriptors).astype(float), axis=1)
+    # rounding 128 components by up to a half, and components cut at the largest
     assert np.all(length < UNIT + 6) and np.median(length) > UNIT - 6
+
+
+def test_packing_keeps_every_component():
+    components = np.random.default_rng(0).integers(0, LARGEST + 1, (50, 128)).astype(np.uint8)
+    assert packed(components).shape == (50, 64)
+    np.testing.assert_array_equal(unpacked(packed(components)), components)
 
 
 def test_distances_are_exact():
     a, b = looking(0).descriptors, looking(1).descriptors
-    difference = a[:, None].astype(np.int64) - b[None].astype(np.int64)
-    np.testing.assert_array_equal(squared_distances(a, b), np.sum(difference**2, axis=2) / UNIT**2)
+    difference = unpacked(a)[:, None].astype(np.int64) - unpacked(b)[None].astype(np.int64)
+    exact = np.sum(difference**2, axis=2).astype(np.float32)
+    np.testing.assert_array_equal(squared_distances(a, b), exact / np.float32(UNIT**2))
 
 
 def test_no_feature_where_depth_is_missing_or_broken():
@@ -67,15 +89,15 @@ def test_no_feature_where_depth_is_missing_or_broken():
     depth[:, 140:160] = np.inf
     depth[:, 160:180] = -1
     found = detect(picture(), depth, CAMERA)
-    assert len(found.pixel) > 20
-    assert found.pixel[:, 0].min() > 178
+    assert len(found.p_cam) > 20
+    assert pixels(found)[:, 0].min() > 178
     assert np.isfinite(found.p_cam).all() and np.isfinite(found.depth).all()
 
 
 def test_no_feature_at_the_edge_of_an_object():
     depth = FLAT.copy()
     depth[:, 160:] = 3.0
-    u = detect(picture(), depth, CAMERA).pixel[:, 0]
+    u = pixels(detect(picture(), depth, CAMERA))[:, 0]
     # columns 159 and 160 have both depths within their square
     assert not np.any((u > 158.5) & (u < 160.5))
     assert np.any((u > 155) & (u < 158.5)) and np.any((u > 160.5) & (u < 164))
@@ -84,7 +106,7 @@ def test_no_feature_at_the_edge_of_an_object():
 @pytest.mark.parametrize("color", [0, 128, 255])
 def test_an_image_without_texture_has_no_features(color):
     found = detect(np.full((240, 320, 3), color, np.uint8), FLAT, CAMERA)
-    assert found.descriptors.shape == (0, 128) and found.p_cam.shape == (0, 3) and found.pixel.shape == (0, 2)
+    assert found.descriptors.shape == (0, 64) and found.p_cam.shape == (0, 3)
 
 
 def test_no_depth_no_features():
@@ -128,8 +150,8 @@ def test_the_same_bits_on_any_number_of_threads():
 def test_a_known_place_is_found_among_others():
     database = [looking(seed) for seed in range(30)]
     rng = np.random.default_rng(0)
-    disturbed = database[17].descriptors.astype(int) + rng.integers(-8, 9, size=(100, 128))
-    current = database[17]._replace(descriptors=np.clip(disturbed, 0, 255).astype(np.uint8))
+    disturbed = unpacked(database[17].descriptors).astype(int) + rng.integers(-1, 2, size=(100, 128))
+    current = database[17]._replace(descriptors=packed(np.clip(disturbed, 0, LARGEST).astype(np.uint8)))
     assert similar(current, database, 3)[0] == 17
     assert similar(current, database, 3) == similar(current, database, 30)[:3]
 

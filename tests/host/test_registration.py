@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.open import open_sequence
 from mipsjax.host import rigid
-from mipsjax.host.features import UNIT, Features, detect
+from mipsjax.host.features import LARGEST, UNIT, Features, detect, packed
 from mipsjax.host.metrics import align_rigid
 from mipsjax.host.registration import MAX_DEVIATION_M, Match, depth_agreement, match_all, relative_pose
 from mipsjax.state import distance
@@ -40,13 +40,13 @@ def cloud(rng, count):
 def descriptors(rng, count):
     """Unrelated ones: random directions of the right length."""
     d = np.abs(rng.normal(size=(count, 128)))
-    return np.minimum(np.rint(UNIT * d / np.linalg.norm(d, axis=1, keepdims=True)), 255).astype(np.uint8)
+    d = np.minimum(np.rint(UNIT * d / np.linalg.norm(d, axis=1, keepdims=True)), LARGEST)
+    return packed(d.astype(np.uint8))
 
 
 def features(p, looks, depth=None):
-    pixel = p[:, :2] / p[:, 2:] * 290.0 + [159.5, 119.5]
     depth = np.zeros((30, 40), np.float32) if depth is None else depth
-    return Features(looks, p.astype(np.float32), pixel.astype(np.float32), depth)
+    return Features(looks, p.astype(np.float32), depth)
 
 
 def wall_depth(T_wall_cam, wall_z=3.0):
@@ -216,8 +216,8 @@ def test_hidden_depth_is_left_out_and_depth_seen_through_contradicts():
     board = wall.copy()
     board[:, 20:] = 1.0
     agreement, coverage = depth_agreement(
-        features(np.ones((1, 3)), np.zeros((1, 128), np.uint8), wall),
-        features(np.ones((1, 3)), np.zeros((1, 128), np.uint8), board),
+        features(np.ones((1, 3)), np.zeros((1, 64), np.uint8), wall),
+        features(np.ones((1, 3)), np.zeros((1, 64), np.uint8), board),
         T,
         CAMERA,
     )

@@ -20,15 +20,17 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from mipsjax.core.camera import Intrinsics
 
 MAX_FEATURES = 600
-"""Kept of one frame: 148 bytes each, 94 kB at most with the coarse depth."""
+"""Kept of one frame: 76 bytes each, 51 kB at most with the coarse depth."""
 MAX_DETECTED = 1000
 """Looked for in the image; more than kept, since depth is missing at some."""
 CONTRAST = 0.01
 """Least contrast of a SIFT extremum: a quarter of the usual, since small indoor images have little of it."""
 WORKING_WIDTH = 640
 """Wider images are reduced to this first: time and memory grow with the pixels, matches hardly do."""
-UNIT = 512
-"""Length of a descriptor in its stored unit: the usual components of RootSIFT then fill a byte."""
+UNIT = 48
+"""Length of a descriptor in its stored unit: of RootSIFT's components one in ten thousand is then over `LARGEST`."""
+LARGEST = 15
+"""Of a stored component, in half a byte. Whole bytes join no more frames (`experiments/features.py`)."""
 
 DEPTH_RADIUS_PX = 1
 """Half width of the square of depths around a keypoint."""
@@ -50,12 +52,10 @@ BACKGROUND = 10
 class Features(NamedTuple):
     """At most `MAX_FEATURES` features of one frame, the largest first."""
 
-    descriptors: UInt8[np.ndarray, "N 128"]
-    """RootSIFT, of length `UNIT` up to rounding."""
+    descriptors: UInt8[np.ndarray, "N 64"]
+    """RootSIFT, of length `UNIT` up to rounding, two components in a byte."""
     p_cam: Float32[np.ndarray, "N 3"]
     """Metres, camera frame."""
-    pixel: Float32[np.ndarray, "N 2"]
-    """(u, v) in the image of the camera given to `detect`."""
     depth: Float32[np.ndarray, "h w"]
     """Depth decimated to about `COARSE_WIDTH` columns, metres, 0 for no measurement: to check a pose with."""
 
@@ -84,7 +84,7 @@ def detect(
     found = found[np.argsort(-extent[found], kind="stable")]
     pixel, z = pixel[found], z[found]
     x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
-    return Features(_root(raw[found]), np.stack([x * z, y * z, z], 1).astype(np.float32), pixel, coarse)
+    return Features(_root(raw[found]), np.stack([x * z, y * z, z], 1).astype(np.float32), coarse)
 
 
 def coarse_stride(camera: Intrinsics) -> int:
@@ -92,14 +92,24 @@ def coarse_stride(camera: Intrinsics) -> int:
     return max(1, round(camera.width / COARSE_WIDTH))
 
 
+def packed(components: UInt8[np.ndarray, "N 128"]) -> UInt8[np.ndarray, "N 64"]:
+    """Two components, of at most `LARGEST`, in a byte."""
+    return components[:, ::2] << 4 | components[:, 1::2]
+
+
+def unpacked(descriptors: UInt8[np.ndarray, "N 64"]) -> UInt8[np.ndarray, "N 128"]:
+    """The components of packed descriptors."""
+    return np.stack([descriptors >> 4, descriptors & LARGEST], axis=2).reshape(len(descriptors), -1)
+
+
 def squared_distances(
-    a: UInt8[np.ndarray, "N 128"], b: UInt8[np.ndarray, "M 128"]
+    a: UInt8[np.ndarray, "N 64"], b: UInt8[np.ndarray, "M 64"]
 ) -> Float32[np.ndarray, "N M"]:
     """Of all pairs of descriptors, in units of `UNIT` squared: 0 for equal, 2 for unrelated ones.
 
     Products and sums stay below 2^24, hence exact in float32.
     """
-    a32, b32 = a.astype(np.float32), b.astype(np.float32)
+    a32, b32 = unpacked(a).astype(np.float32), unpacked(b).astype(np.float32)
     lengths = np.sum(a32 * a32, axis=1)[:, None] + np.sum(b32 * b32, axis=1)[None]
     return (lengths - 2 * (a32 @ b32.T)) / np.float32(UNIT**2)
 
@@ -172,7 +182,7 @@ def _squares(depth: Float32[np.ndarray, "H W"], at: Int[np.ndarray, "K 2"]) -> F
     return padded[v[:, None] + dv[None], u[:, None] + du[None]]
 
 
-def _root(raw: Float32[np.ndarray, "N 128"]) -> UInt8[np.ndarray, "N 128"]:
+def _root(raw: Float32[np.ndarray, "N 128"]) -> UInt8[np.ndarray, "N 64"]:
     """RootSIFT: square roots of the components as shares of their sum, so that Euclidean distance is Hellinger's."""
     share = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1)
-    return np.minimum(np.rint(UNIT * np.sqrt(share)), 255).astype(np.uint8)
+    return packed(np.minimum(np.rint(UNIT * np.sqrt(share)), LARGEST).astype(np.uint8))
