@@ -77,10 +77,18 @@ def run(
     return Run(state, sequence, row | figures(state, sequence) | speed)
 
 
-def follow(frames: Iterable[Frame], camera: Intrinsics, cfg: Config, T_world_cam: Pose) -> SlamState:
-    """The state after frames of any order, numbered and stamped anew; `T_world_cam` is the true pose of the first."""
-    state = None
-    for number, frame in enumerate(frames):
+def follow(
+    frames: Iterable[Frame],
+    camera: Intrinsics,
+    cfg: Config,
+    T_world_cam: Pose,
+    state: SlamState | None = None,
+) -> SlamState:
+    """The state after frames of any order, numbered and stamped anew; `T_world_cam` is the true pose of the first.
+
+    They go on from `state`, if there is one.
+    """
+    for number, frame in enumerate(frames, 0 if state is None else len(state.records)):
         frame = frame._replace(number=number, timestamp=number / RATE)
         if state is None:
             state = slam.start(frame, camera, cfg, T_world_cam)

@@ -10,8 +10,8 @@ mesh is moved by that same alignment. Accuracy is the mean distance of its verti
 one and completeness by 1,000,000 points on each mesh. The reference is culled to what the sensor measured from within
 5 m in every 10th frame. So is the mesh for the sampled accuracy, which drops what lies more than 2 cm behind the true
 surface and flatters it; for completeness the mesh is whole. Seams are measured where the scene is analytic
-(`seams.py`). Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and for each run a picture
-of the trajectory from above and of the mesh.
+(`seams.py`). Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and for each run the mesh, a
+picture of it, and a plan: trajectory and walls from above.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ EVERY = 10  # frames whose depth decides what was seen
 SAMPLES = 1_000_000  # on each mesh
 REFERENCE_VOXEL = 0.02
 FAR = 5.0  # metres
+SLICE = 0.1  # metres above and below the camera: what of the mesh is drawn as walls in a plan
 
 
 def source(name: str) -> str:
@@ -88,12 +89,14 @@ def analytic_row(done: Run, mesh: trimesh.Trimesh, submap: np.ndarray) -> dict[s
     return {"accuracy_cm": 100 * float(np.abs(off.signed).mean())} | seams(vertices, submap, off)
 
 
-def plan(done: Run, T: Pose, path: str) -> None:
-    """The camera's way and the true one from above, metres; submaps by colour, anchors as dots."""
+def plan(done: Run, T: Pose, mesh: trimesh.Trimesh, path: str) -> None:
+    """The camera's way, the true one and the walls from above, metres; submaps by colour, anchors as dots."""
     poses, truth = trajectory(done.state)[:, :3, 3], done.sequence.T_world_cam
     at = volume.moved(T, poses)
     place = np.array([record.submap for record in done.state.records])
     figure, axes = plt.subplots(figsize=(7, 7))
+    walls = mesh.vertices[np.abs(mesh.vertices[:, 1] - truth[:, 1, 3].mean()) < SLICE]
+    axes.plot(walls[:, 0], walls[:, 2], ",", color="gray")
     axes.plot(truth[:, 0, 3], truth[:, 2, 3], color="black", linewidth=0.8, label="true")
     axes.scatter(at[:, 0], at[:, 2], c=place, cmap="tab20", s=4)
     for submap in done.state.submaps:
@@ -177,7 +180,8 @@ def main() -> None:
             print("   ", closed, flush=True)
         write_rows(options.out, rows)
         write_rows(f"{options.out}-memory", memory)
-        plan(done, T, f"plan-{title}")
+        plan(done, T, mesh, f"plan-{title}")
+        mesh.export(OUT / f"mesh-{title}.ply")
         save_picture(OUT / f"mesh-{title}.png", mesh)
 
 

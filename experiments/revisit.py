@@ -1,41 +1,83 @@
-"""Poses where the camera enters a known submap again, with and without bundle adjustment before it.
+"""Poses where the camera enters a known submap again, with and without what keeps them from jumping.
 
-    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--once] [--seed 0] [--variants full ...]
+    python experiments/revisit.py [--name apartment+noise] [--frames 450] [--seed 0] [--variants full no-sr ...]
+    python experiments/revisit.py --name corridor-loop+noise --frames 1590 --once --fork 1400 \\
+        --variants full no-sr unsolved
 
 The first frames of a synthetic scene and the same backwards, so that submaps are left and entered again with the
 drift of the way between; `--once` for a scene that comes back to its beginning on its own. `full`: the frame with
 which a known submap takes over is registered in it, bundle adjustment follows (SR), and the pose graph is solved
-(LC); without SR, without LC, without both; `none`: without registration either, the pose in the known submap is what
-the world poses of the submaps say. RPE over one frame (translation, cm). Writes `revisit.csv`, a row each variant
-with the RPE in the 10 frames from a revisit on and elsewhere, and a plot.
+(LC); without SR, without LC, without both; `unsolved`: the camera goes over to the known submap, which stays where
+drift had put it, as all others; `none`: without SR, LC and registration, the pose in the known submap is what the
+world poses of the submaps say. With `--fork` all variants go on from one run of the first frames, of the `full` one.
+
+RPE over one frame (translation, cm). Writes `revisit.csv`, a row each variant with the RPE in the 10 frames from a
+revisit on and elsewhere (after the fork), and a plot.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import pairwise
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Float64
 
 from common import OUT, changed, follow, show, write_rows
-from mipsjax import territory
+from mipsjax import closure, territory
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.host.metrics import absolute_error
-from mipsjax.state import trajectory
+from mipsjax.state import SlamState, trajectory
 
 AROUND = 10  # frames after a revisit
+
+
+@contextmanager
+def unregistered() -> Iterator[None]:
+    """Frames are linked to other submaps at the pose that was guessed, as if they had not been registered there."""
+    original = territory.sight
+
+    def sight(state, place, keyframe, guess, cfg, measured=False):
+        found = original(state, place, keyframe, guess, cfg, measured)
+        return None if found is None else found._replace(T_sub_cam=guess)
+
+    with replaced(territory, "sight", sight):
+        yield
+
+
+@contextmanager
+def unsolved() -> Iterator[None]:
+    """Loops are found and judged, and submaps stay where they are."""
+    original = closure.solve
+
+    def solve(state, cfg, doubtful=frozenset()):
+        return state, original(state, cfg, doubtful)[1]
+
+    with replaced(closure, "solve", solve):
+        yield
+
+
+@contextmanager
+def replaced(module: ModuleType, name: str, function: Callable[..., Any]) -> Iterator[None]:
+    original = getattr(module, name)
+    setattr(module, name, function)
+    try:
+        yield
+    finally:
+        setattr(module, name, original)
 
 
 class Variant(NamedTuple):
     revisit_steps: int
     loop: bool
-    registered: bool = True
+    without: Callable[[], AbstractContextManager[None]] = nullcontext
 
 
 VARIANTS = {
@@ -43,7 +85,8 @@ VARIANTS = {
     "no-sr": Variant(0, True),
     "no-lc": Variant(10, False),
     "no-sr-no-lc": Variant(0, False),
-    "none": Variant(0, False, registered=False),
+    "unsolved": Variant(10, True, unsolved),
+    "none": Variant(0, False, unregistered),
 }
 
 
@@ -54,19 +97,33 @@ def main() -> None:
     parser.add_argument("--name", default="apartment+noise")
     parser.add_argument("--frames", type=int, default=450)
     parser.add_argument("--once", action="store_true", help="not backwards")
+    parser.add_argument("--fork", type=int, default=0, help="frames that all variants share")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=list(VARIANTS))
     options = parser.parse_args()
     enable_cache()
-    count = len(options.variants)
-    figure, axes = plt.subplots(count, 1, figsize=(9, 2.2 * count), sharex=True, sharey=True, squeeze=False)
+    full = Config(seed=options.seed)
+    sequence = open_sequence(f"synth:{options.name}", frames=slice(0, options.frames), input=full.input)
+    count, fork = len(sequence), options.fork
+    order = [*range(count), *([] if options.once else range(count - 2, -1, -1))]
+    truth = sequence.T_world_cam[order]
+
+    def follow_on(part: list[int], cfg: Config, state: SlamState | None) -> SlamState:
+        return follow((sequence[i] for i in part), sequence.intrinsics, cfg, truth[0], state)
+
+    shared = follow_on(order[:fork], full, None) if fork else None
+    panels = len(options.variants)
+    figure, axes = plt.subplots(panels, 1, figsize=(9, 2.2 * panels), sharex=True, sharey=True, squeeze=False)
     rows = []
     for title, axis in zip(options.variants, axes[:, 0], strict=True):
         variant = VARIANTS[title]
-        cfg = changed(Config(seed=options.seed), "map", revisit_steps=variant.revisit_steps)
+        cfg = changed(full, "map", revisit_steps=variant.revisit_steps)
         cfg = changed(cfg, "loop", enabled=variant.loop)
-        with nullcontext() if variant.registered else unregistered():
-            rpe, active, ate = trial(options.name, options.frames, options.once, cfg)
+        with variant.without():
+            state = follow_on(order[fork:], cfg, shared)
+        poses = trajectory(state)
+        rpe = moved_wrongly(poses, truth)[fork:]
+        active = [record.submap for record in state.records[fork:]]
         entered = [i for i, (a, b) in enumerate(pairwise(active)) if b < a]
         near = np.zeros(len(rpe), bool)
         for i in entered:
@@ -80,47 +137,24 @@ def main() -> None:
                 "rpe_at_max_cm": float(rpe[near].max()) if entered else float("nan"),
                 "rpe_elsewhere_cm": float(np.sqrt(np.mean(rpe[~near] ** 2))),
                 "rpe_elsewhere_max_cm": float(rpe[~near].max()),
-                "ate_cm": ate,
+                "ate_cm": 100 * absolute_error(poses, truth).rmse_m,
             }
         )
         show(rows[-1])
         write_rows("revisit", rows)
-        axis.plot(rpe, linewidth=0.8)
+        axis.plot(np.arange(len(rpe)) + fork, rpe, linewidth=0.8)
         for i in entered:
-            axis.axvline(i, color="red", linestyle="--", linewidth=0.8)
-        axis.set(ylabel="RPE, cm", title=title)
+            axis.axvline(fork + i, color="red", linestyle="--", linewidth=0.8)
+        axis.set(ylabel="RPE, cm", yscale="log", title=title)
     axes[-1, 0].set_xlabel("frame; red: a known submap is entered again")
     figure.tight_layout()
     figure.savefig(OUT / "revisit.png", dpi=110)
 
 
-@contextmanager
-def unregistered() -> Iterator[None]:
-    """Frames are linked to other submaps at the pose that was guessed, as if they had not been registered there."""
-    original = territory.sight
-
-    def sight(state, place, keyframe, guess, cfg, measured=False):
-        found = original(state, place, keyframe, guess, cfg, measured)
-        return None if found is None else found._replace(T_sub_cam=guess)
-
-    territory.sight = sight
-    try:
-        yield
-    finally:
-        territory.sight = original
-
-
-def trial(name: str, count: int, once: bool, cfg: Config) -> tuple[np.ndarray, list[int], float]:
-    """RPE of each frame (cm), the submap of each, and ATE (cm)."""
-    sequence = open_sequence(f"synth:{name}", frames=slice(0, count), input=cfg.input)
-    count = len(sequence)
-    order = [*range(count), *([] if once else range(count - 2, -1, -1))]
-    truth = sequence.T_world_cam[order]
-    state = follow((sequence[i] for i in order), sequence.intrinsics, cfg, truth[0])
-    poses = trajectory(state)
+def moved_wrongly(poses: Float64[np.ndarray, "N 4 4"], truth: Float64[np.ndarray, "N 4 4"]) -> np.ndarray:
+    """RPE from each frame to the next, centimetres."""
     moves, true_moves = (np.linalg.inv(p[:-1]) @ p[1:] for p in (poses, truth))
-    rpe = 100 * np.linalg.norm((np.linalg.inv(true_moves) @ moves)[:, :3, 3], axis=1)
-    return rpe, [record.submap for record in state.records], 100 * absolute_error(poses, truth).rmse_m
+    return 100 * np.linalg.norm((np.linalg.inv(true_moves) @ moves)[:, :3, 3], axis=1)
 
 
 if __name__ == "__main__":
