@@ -4,8 +4,8 @@
 
 `synth:room` with boxes of at most 3 m, so that it needs several submaps. First the whole sequence with each executor in
 turn: frames a second after all is compiled, and whether submaps and trajectory are the same bytes. Then four submaps
-refined ten steps one by one, by one call of `refine_stack`, by `vmap`, and on two forced host devices: milliseconds,
-and the largest difference of any parameter. Writes `executors.csv`, `stacks.csv` and `stacks-2.csv`.
+refined ten steps at the rate of the background one by one, by one call of `refine_stack`, by `vmap`, and on two forced
+host devices: milliseconds, and the largest difference of any parameter. Writes `executors.csv`, `stacks.csv` and `stacks-2.csv`.
 """
 
 from __future__ import annotations
@@ -110,14 +110,18 @@ def stacks(devices: bool) -> None:
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
     stack = jax.tree.map(np.asarray, stack)  # on no device yet
 
+    rate = np.float32(cfg.background.rate)
+
     def one_by_one():
         each = [
-            mapping.refine(*part, steps, key, camera, cfg)[0] for part, key in zip(parts, keys, strict=True)
+            mapping.refine(*part, steps, key, camera, cfg, rate)[0]
+            for part, key in zip(parts, keys, strict=True)
         ]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
     def together(vmap: bool) -> Callable[[], mapping.Learned]:
-        return lambda: mapping.refine_stack(*stack, steps, keys, camera, cfg, jnp.ones(SUBMAPS), vmap)[0]
+        rates = jnp.full(SUBMAPS, rate)
+        return lambda: mapping.refine_stack(*stack, steps, keys, camera, cfg, rates, vmap)[0]
 
     ways = {"one by one": one_by_one, "one call": together(False), "vmap": together(True)}
     single, rows = one_by_one(), []
