@@ -5,7 +5,8 @@
 `synth:room` with boxes of at most 3 m, so that it needs several submaps. First the whole sequence with each executor in
 turn: frames a second after all is compiled, and whether submaps and trajectory are the same bytes. Then four submaps
 refined ten steps at the rate of the background one by one, by one call of `refine_stack`, by `vmap`, and on two forced
-host devices: milliseconds, and the largest difference of any parameter. Writes `executors.csv`, `stacks.csv` and `stacks-2.csv`.
+host devices: milliseconds, and the largest difference of any parameter. Writes `executors.csv`, `stacks.csv` and
+`stacks-2.csv`.
 """
 
 from __future__ import annotations
