@@ -22,6 +22,7 @@ import gc
 import resource
 from typing import Any
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
@@ -109,8 +110,11 @@ def plan(done: Run, T: Pose, mesh: trimesh.Trimesh, path: str) -> None:
 
 
 class Memory:
-    """Each time the number of submaps has grown: resident memory without what other processes could share, after the
-    allocator gave back what it had kept (glibc keeps tens of megabytes more or less), and what fills it."""
+    """Each time the number of submaps has grown: all arrays of the state, and resident memory without what other
+    processes could share, after the allocator gave back what it had kept (glibc keeps tens of megabytes more or less).
+
+    Resident memory also grows by what is loaded once, when it is needed: programs and, with the first loop, GTSAM.
+    """
 
     def __init__(self, about: dict[str, Any]) -> None:
         self.rows: list[dict[str, Any]] = []
@@ -126,8 +130,10 @@ class Memory:
             _, resident, shared, *_ = (int(pages) * resource.getpagesize() for pages in file.read().split())
         kept = {k.number: k for submap in state.submaps for k in submap.keyframes}.values()
         pixels = sum(k.depth.nbytes + k.color.nbytes for k in kept)
+        arrays = {id(a): a.nbytes for a in jax.tree.leaves(state) if isinstance(a, np.ndarray | jax.Array)}
         sizes = {
             "resident": resident - shared,
+            "arrays": sum(arrays.values()),
             "pixels": pixels,
             "features": sum(map(keyframe_bytes, kept)) - pixels,
             "thumbnails": sum(r.depth.nbytes for r in state.records if r.depth is not None),
@@ -136,11 +142,11 @@ class Memory:
         self.rows.append(self._about | counts | {f"{k}_mb": v / 1e6 for k, v in sizes.items()})
 
     def growth_mb(self) -> float:
-        """Slope over the number of submaps, from two on, without the pixels of keyframes."""
+        """Slope of the arrays over the number of submaps, from two on, without the pixels of keyframes."""
         several = [row for row in self.rows if row["submaps"] > 1]
         if len(several) < 2:
             return float("nan")
-        rest = [row["resident_mb"] - row["pixels_mb"] for row in several]
+        rest = [row["arrays_mb"] - row["pixels_mb"] for row in several]
         return float(np.polyfit([row["submaps"] for row in several], rest, 1)[0])
 
 
