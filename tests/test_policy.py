@@ -25,6 +25,7 @@ PLAIN = FrameStats(
     residual=0.01,
     least_residual=0.008,
     unsure=False,
+    lost=0,
     since_keyframe=5,
     translation=0.05,
     rotation=0.02,
@@ -72,6 +73,11 @@ def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
     unsure = PLAIN._replace(unsure=True)
     assert decide(unsure._replace(residual=0.017), CFG).status is Status.OK
     assert decide(unsure._replace(residual=0.019), CFG).status is Status.LOST
+    few, many = unsure._replace(lost=9), unsure._replace(lost=10)
+    assert decide(few._replace(residual=0.017), CFG).status is Status.OK
+    assert decide(many._replace(residual=0.011), CFG).status is Status.OK
+    assert decide(many._replace(residual=0.013), CFG).status is Status.LOST
+    assert decide(many._replace(residual=0.017, least_residual=0.012), CFG).status is Status.OK
     noisy = PLAIN._replace(least_residual=0.02)
     assert decide(noisy._replace(residual=0.029), CFG).status is Status.OK
     assert decide(noisy._replace(residual=0.031), CFG).status is Status.LOST

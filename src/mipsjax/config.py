@@ -242,6 +242,11 @@ class GuardConfig:
     tracked well have at most 18 mm, another room 20 to 30."""
     residual_unsure: float = 0.018
     """The same after a lost or skipped frame: what fits somewhere may be another place."""
+    residual_lost: float = 0.012
+    """The same after `lost_frames` lost frames or more: of so many wide searches one ends where another place fits by
+    chance. A frame that fits worse and is known is found by its image."""
+    lost_frames: int = 10
+    """In a row."""
     noise: float = 1.5
     """Factor on the least residual of late, below which a residual is the sensor's."""
 

@@ -131,6 +131,8 @@ RANGES: dict[str, Range] = {
     "guard.measured": SHARE,
     "guard.residual": SWITCH,
     "guard.residual_unsure": SWITCH,
+    "guard.residual_lost": SWITCH,
+    "guard.lost_frames": COUNT,
     "guard.noise": POSITIVE,
     "volume.far": POSITIVE,
     "volume.max_side": POSITIVE,
@@ -183,6 +185,7 @@ NOT_BELOW = (
     ("field.truncation", "mesh.band"),
     ("guard.weak", "guard.lost"),
     ("guard.residual", "guard.residual_unsure"),
+    ("guard.residual_unsure", "guard.residual_lost"),
     ("correspond.max_gradient", "correspond.min_gradient"),
 )
 """Pairs whose first field must not be below the second."""

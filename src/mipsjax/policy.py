@@ -38,6 +38,8 @@ class FrameStats(NamedTuple):
     """Of late; 0 for the first tracked frame."""
     unsure: bool
     """The frame before was lost or skipped."""
+    lost: int
+    """Frames before it that were lost, in a row."""
     since_keyframe: int
     """Processed frames since the last keyframe."""
     translation: float
@@ -112,12 +114,18 @@ def converged(residual: float, cfg: Config) -> float:
 def _status(stats: FrameStats, cfg: Config) -> Status:
     guard = cfg.guard
     unknown = stats.known < guard.lost or stats.confirmed < guard.confirmed
-    # What fits somewhere after a loss may be another place
-    limit = max(guard.residual_unsure if stats.unsure else guard.residual, guard.noise * stats.least_residual)
+    limit = max(_allowed(stats, cfg), guard.noise * stats.least_residual)
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
     return Status.WEAK if stats.known < guard.weak or _is_sparse(stats, cfg) else Status.OK
+
+
+def _allowed(stats: FrameStats, cfg: Config) -> float:
+    """Metres of residual: what fits somewhere after a loss may be another place, the more so the longer it lasts."""
+    if stats.lost >= cfg.guard.lost_frames:
+        return cfg.guard.residual_lost
+    return cfg.guard.residual_unsure if stats.unsure else cfg.guard.residual
 
 
 def _is_sparse(stats: FrameStats, cfg: Config) -> bool:

@@ -286,6 +286,7 @@ def _stats(state: SlamState, depth: np.ndarray, T_sub_cam: Pose, info: tracking.
         residual=float(info.after.residual),
         least_residual=state.residual,
         unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),
+        lost=lost_in_a_row(state),
         since_keyframe=len(state.records) - keyframe.number,
         translation=translation,
         rotation=rotation,
