@@ -9,7 +9,7 @@ drift of the way between; `--once` for a scene that comes back to its beginning 
 which a known submap takes over is registered in it, bundle adjustment follows (SR), and the pose graph is solved
 (LC); without SR, without LC, without both; `glued`: with a loop the camera goes over to the known submap at once, and
 all submaps stay where drift had put them; `none`: without SR, LC and registration, the pose in the known submap is what
-the world poses of the submaps say. With `--fork` all variants go on from one run of the first frames, of the `full` one.
+the world poses of the submaps say. With `--fork` all variants go on from one run of the first frames, as `full`.
 
 RPE over one frame (translation, cm). Writes `revisit.csv`, a row each variant with the RPE in the 10 frames from a
 revisit on and elsewhere (after the fork), and a plot.
