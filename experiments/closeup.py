@@ -18,11 +18,11 @@ from jaxtyping import Float64, UInt8
 
 from common import OUT
 from mipsjax.core.camera import Intrinsics
-from mipsjax.host.picture import save_png
-from mipsjax.host.render import face_geometry, render_mesh, vertex_colors
+from mipsjax.host.picture import facing, save_png, with_faces
+from mipsjax.host.render import render_mesh
 
 WIDTH, HEIGHT = 480, 400
-FIELD_OF_VIEW_DEG = 30.0
+FIELD_OF_VIEW_DEG = 30.0  # from top to bottom, the shorter side
 
 
 def main() -> None:
@@ -65,12 +65,8 @@ def panel(
     T_world_cam: Float64[np.ndarray, "4 4"],
 ) -> UInt8[np.ndarray, "H W 3"]:
     inside = ((mesh.vertices >= low) & (mesh.vertices <= high)).all(axis=1)
-    normals, _ = face_geometry(mesh)
-    towards = np.einsum("fi,fi->f", normals, T_world_cam[:3, 3] - np.asarray(mesh.triangles)[:, 0]) > 0
-    faces = np.asarray(mesh.faces)
-    faces = faces[inside[faces].all(axis=1) & towards]
-    part = trimesh.Trimesh(mesh.vertices, faces, vertex_colors=vertex_colors(mesh), process=False)
-    focal = WIDTH / 2 / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2)
+    part = with_faces(mesh, inside[mesh.faces].all(axis=1) & facing(mesh, T_world_cam[:3, 3]))
+    focal = HEIGHT / 2 / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2)
     camera = Intrinsics(focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
     return render_mesh(part, T_world_cam, camera).color
 

@@ -78,6 +78,8 @@ def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
     assert decide(many._replace(residual=0.011), CFG).status is Status.OK
     assert decide(many._replace(residual=0.013), CFG).status is Status.LOST
     assert decide(many._replace(residual=0.017, least_residual=0.012), CFG).status is Status.OK
+    blind = replace(CFG, loop=replace(CFG.loop, relocalise=False))
+    assert decide(many._replace(residual=0.017), blind).status is Status.OK, "nothing else would find it"
     noisy = PLAIN._replace(least_residual=0.02)
     assert decide(noisy._replace(residual=0.029), CFG).status is Status.OK
     assert decide(noisy._replace(residual=0.031), CFG).status is Status.LOST

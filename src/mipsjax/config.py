@@ -239,12 +239,12 @@ class GuardConfig:
     pixels leave its pose open."""
     residual: float = 0.024
     """Metres; a frame with a larger residual is lost, if also `noise` times the least of late is less. Frames that are
-    tracked well have at most 18 mm, another room 20 to 30."""
+    tracked well have at most 18 mm, another room 18 to 30, the less the more often it is tried."""
     residual_unsure: float = 0.018
     """The same after a lost or skipped frame: what fits somewhere may be another place."""
     residual_lost: float = 0.012
-    """The same after `lost_frames` lost frames or more: of so many wide searches one ends where another place fits by
-    chance. A frame that fits worse and is known is found by its image."""
+    """The same after `lost_frames` lost frames or more, if `loop.relocalise` looks for them by their images: of so many
+    wide searches one ends where another place fits by chance. As much as `track.ro.residual`, what needs no search."""
     lost_frames: int = 10
     """In a row."""
     noise: float = 1.5

@@ -39,7 +39,7 @@ class FrameStats(NamedTuple):
     unsure: bool
     """The frame before was lost or skipped."""
     lost: int
-    """Frames before it that were lost, in a row."""
+    """Frames before it that were lost, in a row but for skipped ones."""
     since_keyframe: int
     """Processed frames since the last keyframe."""
     translation: float
@@ -122,8 +122,8 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
 
 
 def _allowed(stats: FrameStats, cfg: Config) -> float:
-    """Metres of residual: what fits somewhere after a loss may be another place, the more so the longer it lasts."""
-    if stats.lost >= cfg.guard.lost_frames:
+    """Metres of residual: what fits somewhere after a loss may be another place, even more so after a long one."""
+    if cfg.loop.relocalise and stats.lost >= cfg.guard.lost_frames:
         return cfg.guard.residual_lost
     return cfg.guard.residual_unsure if stats.unsure else cfg.guard.residual
 

@@ -18,9 +18,13 @@ from mipsjax.config import (
 from mipsjax.config_submaps import BackgroundConfig, BlendConfig, LoopConfig, VolumeConfig
 from mipsjax.errors import ConfigError
 
-NEVER = float("inf")
 UNGUARDED = GuardConfig(
-    weak=0.6, lost=0.4, confirmed=0.0, residual=NEVER, residual_unsure=NEVER, residual_lost=NEVER
+    weak=0.6,
+    lost=0.4,
+    confirmed=0.0,
+    residual=float("inf"),
+    residual_unsure=float("inf"),
+    residual_lost=float("inf"),
 )
 """Judges a pose by its pixels that are known, and that have depth, alone: the paper has no guard, and a map of `tiny`
 is certain of nothing."""

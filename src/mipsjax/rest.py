@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 
 from mipsjax.core.mapping import Learned
 
-HALF = np.dtype(jnp.bfloat16)
+BFLOAT16 = np.dtype(jnp.bfloat16)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("taken", "values"), meta_fields=("shape",))
 @dataclass(frozen=True)
 class Packed:
-    """An array in bfloat16 without its zeros, which are most of a hash grid's coarse levels: no point lies there."""
+    """An array in bfloat16 without its zeros: what no sample has reached, as most of a hash grid's coarse levels."""
 
     taken: UInt8[np.ndarray, " B"]
     """A bit an entry: whether it is among the values."""
-    values: np.ndarray
+    values: Shaped[np.ndarray, " V"]
     """Of type bfloat16."""
-    shape: tuple[int, ...] = field(kw_only=True)
+    shape: tuple[int, ...]
+    """Of the whole array."""
 
 
 def rested(learned: Learned) -> Learned:
@@ -44,9 +45,9 @@ def awake(learned: Learned) -> Learned:
 def _pack(leaf: Any) -> Any:
     if _is_packed(leaf) or leaf.dtype != np.float32:
         return leaf
-    bits = np.asarray(leaf).astype(HALF).view(np.uint16).ravel()  # none is set in a zero
-    taken = bits != 0
-    return Packed(np.packbits(taken), bits[taken].view(HALF), shape=leaf.shape)
+    bits = np.asarray(leaf).astype(BFLOAT16).view(np.uint16).ravel()
+    taken = bits != 0  # -0 has its sign, and is kept
+    return Packed(np.packbits(taken), bits[taken].view(BFLOAT16), leaf.shape)
 
 
 def _unpack(leaf: Any) -> Float32[np.ndarray, "..."] | Any:

@@ -29,8 +29,8 @@ WORKING_WIDTH = 640
 """Wider images are reduced to this first: time and memory grow with the pixels, matches hardly do."""
 UNIT = 48
 """Length of a descriptor in its stored unit: of RootSIFT's components one in ten thousand is then over `LARGEST`."""
-LARGEST = 15
-"""Of a stored component, in half a byte. Whole bytes join no more frames (`experiments/features.py`)."""
+LARGEST = 2**4 - 1
+"""Of a stored component, in half a byte."""
 
 DEPTH_RADIUS_PX = 1
 """Half width of the square of depths around a keypoint."""

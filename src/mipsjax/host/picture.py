@@ -79,7 +79,7 @@ def picture(
     filled = [_filled_pixels(points, normals, pose, _overview_intrinsics(trial)) for pose in poses]
     pose = poses[int(np.argmax(filled))]
     fine = _overview_intrinsics((width * SUPERSAMPLING, height * SUPERSAMPLING))
-    color = render_mesh(_keep_faces(mesh, _facing(mesh, pose[:3, 3])), pose, fine).color
+    color = render_mesh(with_faces(mesh, facing(mesh, pose[:3, 3])), pose, fine).color
     return np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -136,12 +136,14 @@ def _filled_pixels(
     return len(np.unique(v * intrinsics.width + u))
 
 
-def _facing(mesh: trimesh.Trimesh, eye: Float64[np.ndarray, "3"]) -> Bool[np.ndarray, "F"]:
+def facing(mesh: trimesh.Trimesh, eye: Float64[np.ndarray, "3"]) -> Bool[np.ndarray, "F"]:
+    """The faces whose front is seen from a point."""
     normals, _ = face_geometry(mesh)
     return np.einsum("fi,fi->f", normals, eye - np.asarray(mesh.triangles)[:, 0]) > 0
 
 
-def _keep_faces(mesh: trimesh.Trimesh, keep: Bool[np.ndarray, "F"]) -> trimesh.Trimesh:
+def with_faces(mesh: trimesh.Trimesh, keep: Bool[np.ndarray, "F"]) -> trimesh.Trimesh:
+    """Some faces of a mesh, in its colours."""
     faces = np.asarray(mesh.faces)[keep]
     return trimesh.Trimesh(mesh.vertices, faces, vertex_colors=vertex_colors(mesh), process=False)
 
