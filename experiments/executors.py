@@ -1,12 +1,13 @@
 """Background refinement inline and in a thread; submaps refined one by one and together.
 
-    python experiments/executors.py [--frames 300] [--repeats 2]
+    python experiments/executors.py [--frames 300] [--repeats 4] [--every 4 1]
 
 `synth:room` with boxes of at most 3 m, so that it needs several submaps. First the whole sequence with each executor in
-turn: frames a second after all is compiled, and whether submaps and trajectory are the same bytes. Then four submaps
-refined ten steps at the rate of the background one by one, by one call of `refine_stack`, by `vmap`, and on two forced
-host devices: milliseconds, and the largest difference of any parameter. Writes `executors.csv`, `stacks.csv` and
-`stacks-2.csv`.
+turn, with a refinement every so many frames: frames a second after all is compiled, and whether submaps and trajectory
+are the same bytes. Then four submaps
+refined ten steps at the rate of the background one by one, by `vmap` of `refine` (`refine_stack`), and all at once, as
+`vmap` does it on accelerators; the same on two forced host devices: milliseconds, and the largest difference of any
+parameter. Writes `executors.csv`, `stacks.csv` and `stacks-2.csv`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,38 +48,41 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--every", type=int, nargs="*", default=[4, 1])
     parser.add_argument("--stacks-only", action="store_true")
     options = parser.parse_args()
     enable_cache()
     if not options.stacks_only:
-        executors(options.frames, options.repeats)
+        executors(options.frames, options.repeats, options.every)
     stacks(options.stacks_only)
     if not options.stacks_only:
         again = [sys.executable, str(Path(__file__).resolve()), "--stacks-only"]
         subprocess.run(again, env=os.environ | {"XLA_FLAGS": TWO_DEVICES}, check=True)
 
 
-def executors(frames: int, repeats: int) -> None:
-    cfg = changed(Config(), "volume", max_side=3.0)
-    sequence = open_sequence("synth:room", frames=slice(0, frames), input=cfg.input)
+def executors(frames: int, repeats: int, every: list[int]) -> None:
+    small = changed(Config(), "volume", max_side=3.0)
+    sequence = open_sequence("synth:room", frames=slice(0, frames), input=small.input)
     images = [sequence[i] for i in range(len(sequence))]
-    rows, first = [], None
-    for number in range(2 * repeats + 1):
-        kind = ("inline", "thread")[number % 2]
-        state, seconds = run(images, sequence, changed(cfg, "background", executor=kind))
-        first = state if first is None else first
-        rows.append(
-            {
-                "executor": kind,
-                "compiles": number == 0,
-                "submaps": len(state.submaps),
-                "fps": (len(images) - 1) / seconds,
-                "same_bytes": same(state, first),
-            }
-        )
-        show(rows[-1])
-        write_rows("executors", rows)
+    rows = []
+    for between in every:
+        cfg = changed(small, "background", every_frames=between)
+        first, _ = run(images, sequence, cfg)  # compiles
+        for number in range(2 * repeats):
+            kind = ("inline", "thread")[number % 2]
+            state, seconds = run(images, sequence, changed(cfg, "background", executor=kind))
+            rows.append(
+                {
+                    "every_frames": between,
+                    "executor": kind,
+                    "submaps": len(state.submaps),
+                    "fps": (len(images) - 1) / seconds,
+                    "same_bytes": same(state, first),
+                }
+            )
+            show(rows[-1])
+            write_rows("executors", rows)
 
 
 def run(images: list, sequence: Sequence, cfg: Config) -> tuple[SlamState, float]:
@@ -120,11 +125,15 @@ def stacks(devices: bool) -> None:
         ]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
-    def together(vmap: bool) -> Callable[[], mapping.Learned]:
-        rates = jnp.full(SUBMAPS, rate)
-        return lambda: mapping.refine_stack(*stack, steps, keys, camera, cfg, rates, vmap)[0]
+    rates = jnp.full(SUBMAPS, rate)
 
-    ways = {"one by one": one_by_one, "one call": together(False), "vmap": together(True)}
+    def together():
+        return mapping.refine_stack(*stack, steps, keys, camera, cfg, rates)[0]
+
+    batched = jax.jit(jax.vmap(partial(mapping.descend, camera=camera, cfg=cfg), (0, 0, None, 0, 0)))
+    ways = {"one by one": one_by_one, "vmap": together}
+    if not devices:
+        ways["all at once"] = lambda: batched(*stack, steps, keys, rates)[0]
     single, rows = one_by_one(), []
     for name, way in ways.items():
         rows.append(

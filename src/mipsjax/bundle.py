@@ -103,9 +103,8 @@ def refine_together(
     )
     learned, views, keys_ = stack
     network_rates = jnp.full(len(submaps), rate, jnp.float32)
-    at_once = jax.default_backend() != "cpu"  # where one submap leaves most of the device idle
     learned, poses, _ = mapping.refine_stack(
-        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, network_rates, at_once
+        learned, views, jnp.int32(steps), keys_, mapping_camera(camera, cfg), cfg, network_rates
     )
     learned = jax.device_get(learned)  # and back to the first device, whatever refined it
     refined = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -65,14 +66,15 @@ def test_a_stack_is_refined_as_one_by_one():
     assert farthest(at_once, one_by_one(stack, keys)) == 0
 
 
-def test_vmap_gives_the_same_but_for_rounding():
+def test_batched_as_on_an_accelerator_it_is_the_same_but_for_rounding():
     """Which Adam enlarges where a gradient is about zero, and a step of ReLU where it changes side."""
     stack, keys = stacked()
-    vmapped = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG, RATES, vmap=True)[0]
+    one = partial(mapping.descend, camera=CAMERA, cfg=CFG)
+    batched = jax.jit(jax.vmap(one, (0, 0, None, 0, 0)))(*stack, jnp.int32(1), keys, RATES)[0]
     single = mapping.refine_stack(*stack, jnp.int32(1), keys, CAMERA, CFG, RATES)[0]
     off = [
         np.abs(a - b).ravel()
-        for a, b in zip(*map(jax.tree.leaves, jax.device_get((vmapped.field, single.field))), strict=True)
+        for a, b in zip(*map(jax.tree.leaves, jax.device_get((batched.field, single.field))), strict=True)
     ]
     flat = np.concatenate(off)
     assert np.mean(flat > 1e-6) < 1e-3 and flat.max() < 1e-4

@@ -102,7 +102,26 @@ def refine(
 
     `rate` is a share of the networks' learning rate.
     Returns what was learned, the poses and an info; all as before where anything became infinite or NaN.
+
+    On a CPU `vmap` refines one submap after the other, to the same bits as alone. All at once their activations do not
+    stay in its cache, and sums are rounded otherwise, of which Adam makes whole steps where a gradient is about zero.
     """
+    one = partial(descend, camera=camera, cfg=cfg)
+    if jax.default_backend() == "cpu":
+        one = jax.custom_batching.sequential_vmap(one)
+    return one(learned, frames, steps, key, jnp.asarray(rate))
+
+
+def descend(
+    learned: Learned,
+    frames: Frames,
+    steps: Int[Array, ""],
+    key: PRNGKeyArray,
+    rate: Float[Array, ""],
+    camera: Intrinsics,
+    cfg: Config,
+) -> tuple[Learned, Float[Array, "F 4 4"], MapInfo]:
+    """What `refine` does, of which `vmap` is batched on any device."""
     pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
 
     def step(i, carry):
@@ -124,7 +143,7 @@ def refine(
     return learned, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg", "vmap"))
+@partial(jax.jit, static_argnames=("camera", "cfg"))
 def refine_stack(
     learned: Learned,
     frames: Frames,
@@ -133,25 +152,22 @@ def refine_stack(
     camera: Intrinsics,
     cfg: Config,
     rates: Float[Array, "S"],
-    vmap: bool = False,
 ) -> tuple[Learned, Float[Array, "S F 4 4"], MapInfo]:
     """`refine` of S submaps in one call: learned, frames, keys and rates have a leading axis of them.
 
-    That axis is spread over the devices, if S is a multiple of their number; each refines its part one after the
-    other, to the same bits as `refine`, or with `vmap` all at once, rounded otherwise.
+    That axis is spread over the devices, if S is a multiple of their number.
     """
 
-    def one(part):
-        mine, views, key, rate = part
-        return refine(mine, views, steps, key, camera, cfg, rate)
+    @jax.vmap
+    def several(learned, frames, key, rate):
+        return refine(learned, frames, steps, key, camera, cfg, rate)
 
-    several = jax.vmap(one) if vmap else partial(jax.lax.map, one)
     devices = jax.devices()
     if len(devices) > 1 and len(keys) % len(devices) == 0:
         mesh = jax.sharding.Mesh(np.array(devices), ("submap",))
         shares = jax.sharding.PartitionSpec("submap")
         several = jax.shard_map(several, mesh=mesh, in_specs=shares, out_specs=shares, check_vma=False)
-    return several((learned, frames, keys, rates))
+    return several(learned, frames, keys, rates)
 
 
 def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
