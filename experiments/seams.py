@@ -2,7 +2,8 @@
 
 A mesh is off by a little everywhere, most where things are small or were far away, so that two parts of it are off by
 different amounts whether a border runs between them or not. A seam is what a border adds to that. Two submaps that do
-not fit show it all along their border: so the median step of each border is given too.
+not fit show it all along their border, or at least along a piece of it: so there are also medians of whole borders,
+with and without the sign, and of pieces, beside those of pieces without a border.
 
 Only flat cells count: walls, floors, table tops, where a step would show. There the signed error of both sides is that
 of one plane; elsewhere each side may hold another part of a chair.
@@ -10,6 +11,8 @@ of one plane; elsewhere each side may hold another part of a chair.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +23,8 @@ from mipsjax.data.synth.scene import Scene
 
 CELL = 0.25  # metres
 FEWEST = 20  # vertices on a side
-LEAST_BORDER = 5  # cells of a border whose median says something
+PIECE = 1.0  # metres
+LEAST_CELLS = 5  # of a border, or a piece of it, whose median says something
 FLAT_M = 0.005  # the scene's surface in a flat cell is a plane up to this
 FLAT_NORMAL = 0.98  # least length of the mean of its normals
 CHUNK = 20_000
@@ -33,6 +37,17 @@ class Errors(NamedTuple):
     """Metres, positive in free space."""
     normal: Float[np.ndarray, "N 3"]
     """Of the nearest surface."""
+
+
+class Step(NamedTuple):
+    """In one cell."""
+
+    between: tuple[int, ...]
+    """The submaps on either side; one where there is no border."""
+    piece: tuple[int, ...]
+    """Which cube of `PIECE` it is in."""
+    cm: float
+    """Error of the second less that of the first."""
 
 
 @jax.jit
@@ -56,44 +71,64 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
     `vertices` are in the scene's frame; `submap` is the one that leads at each, -1 for none.
     """
     rng = np.random.default_rng(0)
-    steps: dict[str, list[float]] = {"seam": [], "control": []}
-    borders: dict[tuple[int, ...], list[float]] = {}
+    steps: dict[str, list[Step]] = {"seam": [], "control": []}
     foot = vertices - off.signed[:, None] * off.normal
     for members in _cells(vertices):
         if len(members) < 2 * FEWEST or not _flat(foot[members], off.normal[members]):
             continue
+        piece = tuple(np.floor(foot[members].mean(0) / PIECE).astype(int).tolist())
         places, counts = np.unique(submap[members], return_counts=True)
-        two = places[np.argsort(counts, kind="stable")[-2:]]
+        two = np.sort(places[np.argsort(counts, kind="stable")[-2:]])
         sides = [members[submap[members] == place] for place in two]
+        between = tuple(two.tolist())
         if len(places) == 1 and places[0] >= 0:
             along = vertices[members] @ rng.standard_normal(3)
             order = members[np.argsort(along)]
             place = int(rng.integers(FEWEST, len(members) - FEWEST + 1))
-            steps["control"].append(_step(order[:place], order[place:], off))
+            steps["control"].append(Step(between, piece, _step(order[:place], order[place:], off)))
         elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
-            steps["seam"].append(_step(*sides, off))
-            borders.setdefault(tuple(sorted(two.tolist())), []).append(steps["seam"][-1])
-    medians = [float(np.median(sizes)) for sizes in borders.values() if len(sizes) >= LEAST_BORDER]
-    return {
-        "borders": len(medians),
-        "worst_border_median_cm": max(medians, default=float("nan")),
-    } | {
-        f"{name}_{key}": value
-        for name, sizes in steps.items()
-        if sizes
-        for key, value in {
-            "cells": len(sizes),
-            "median_cm": float(np.median(sizes)),
-            "95_cm": float(np.quantile(sizes, 0.95)),
-            "max_cm": max(sizes),
-            "over_1_cm": float(np.mean(np.greater(sizes, 1))),
-        }.items()
+            steps["seam"].append(Step(between, piece, _step(*sides, off)))
+    borders = _grouped(steps["seam"], lambda step: step.between)
+    row: dict[str, Any] = {
+        "borders": len(borders),
+        "worst_border_median_cm": max((_median(np.abs(b)) for b in borders), default=np.nan),
+        "worst_border_offset_cm": max((abs(_median(b)) for b in borders), default=np.nan),
     }
+    for name, some in steps.items():
+        row |= {f"{name}_{key}": value for key, value in _summary(some).items()} if some else {}
+    return row
+
+
+def _summary(steps: list[Step]) -> dict[str, float]:
+    sizes = np.abs([step.cm for step in steps])
+    pieces = [_median(np.abs(piece)) for piece in _grouped(steps, lambda step: (step.between, step.piece))]
+    return {
+        "cells": len(sizes),
+        "median_cm": _median(sizes),
+        "95_cm": float(np.quantile(sizes, 0.95)),
+        "max_cm": float(sizes.max()),
+        "over_1_cm": float(np.mean(sizes > 1)),
+        "pieces": len(pieces),
+        "worst_piece_cm": max(pieces, default=np.nan),
+        "pieces_over_1_cm": int(np.sum(np.greater(pieces, 1))),
+    }
+
+
+def _grouped(steps: list[Step], by: Callable[[Step], Any]) -> list[list[float]]:
+    """Steps of those groups that have enough of them."""
+    groups = defaultdict(list)
+    for step in steps:
+        groups[by(step)].append(step.cm)
+    return [group for group in groups.values() if len(group) >= LEAST_CELLS]
+
+
+def _median(values: Any) -> float:
+    return float(np.median(values))
 
 
 def _step(one: Int[np.ndarray, " A"], other: Int[np.ndarray, " B"], off: Errors) -> float:
     """Centimetres between the median errors of two sets of vertices."""
-    return 100 * abs(float(np.median(off.signed[one]) - np.median(off.signed[other])))
+    return 100 * (_median(off.signed[other]) - _median(off.signed[one]))
 
 
 def _cells(vertices: Float[np.ndarray, "N 3"]) -> list[Int[np.ndarray, " M"]]:
