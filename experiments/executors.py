@@ -3,11 +3,11 @@
     python experiments/executors.py [--frames 300] [--repeats 4] [--every 4 1]
 
 `synth:room` with boxes of at most 3 m, so that it needs several submaps. First the whole sequence with each executor in
-turn, with a refinement every so many frames: frames a second after all is compiled, and whether submaps and trajectory
-are the same bytes. Then four submaps
-refined ten steps at the rate of the background one by one, by `vmap` of `refine` (`refine_stack`), and all at once, as
-`vmap` does it on accelerators; the same on two forced host devices: milliseconds, and the largest difference of any
-parameter. Writes `executors.csv`, `stacks.csv` and `stacks-2.csv`.
+turn, with a refinement every so many frames: frames a second after all is compiled, how many processors worked on
+average, and whether submaps and trajectory are the same bytes. Then four submaps refined ten steps at the rate of the
+background one by one, by `vmap` of `refine` (`refine_stack`), and all at once, as that is on accelerators; the first
+two also on two forced host devices: milliseconds, and the largest difference of any parameter. Writes `executors.csv`,
+`stacks.csv` and `stacks-2.csv`.
 """
 
 from __future__ import annotations
@@ -68,16 +68,17 @@ def executors(frames: int, repeats: int, every: list[int]) -> None:
     rows = []
     for between in every:
         cfg = changed(small, "background", every_frames=between)
-        first, _ = run(images, sequence, cfg)  # compiles
+        first = run(images, sequence, cfg)[0]  # compiles
         for number in range(2 * repeats):
             kind = ("inline", "thread")[number % 2]
-            state, seconds = run(images, sequence, changed(cfg, "background", executor=kind))
+            state, seconds, worked = run(images, sequence, changed(cfg, "background", executor=kind))
             rows.append(
                 {
                     "every_frames": between,
                     "executor": kind,
                     "submaps": len(state.submaps),
                     "fps": (len(images) - 1) / seconds,
+                    "processors": worked / seconds,
                     "same_bytes": same(state, first),
                 }
             )
@@ -85,15 +86,16 @@ def executors(frames: int, repeats: int, every: list[int]) -> None:
             write_rows("executors", rows)
 
 
-def run(images: list, sequence: Sequence, cfg: Config) -> tuple[SlamState, float]:
+def run(images: list, sequence: Sequence, cfg: Config) -> tuple[SlamState, float, float]:
+    """The end, and seconds by the clock and of both processors."""
     with executor(cfg.background.executor) as beside:
         # One config for all compiled code, whatever the executor
         cfg = changed(cfg, "background", executor="inline")
         state = slam.start(images[0], sequence.intrinsics, cfg)
-        began = time.perf_counter()
+        began, worked = time.perf_counter(), time.process_time()
         for image in images[1:]:
             state = slam.step(state, image, cfg, beside)
-        return state, time.perf_counter() - began
+        return state, time.perf_counter() - began, time.process_time() - worked
 
 
 def same(one: SlamState, other: SlamState) -> bool:
@@ -117,21 +119,20 @@ def stacks(devices: bool) -> None:
     stack = jax.tree.map(np.asarray, stack)  # on no device yet
 
     rate = np.float32(cfg.background.rate)
+    rates = jnp.full(SUBMAPS, rate)
 
-    def one_by_one():
+    def one_by_one() -> mapping.Learned:
         each = [
             mapping.refine(*part, steps, key, camera, cfg, rate)[0]
             for part, key in zip(parts, keys, strict=True)
         ]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
-    rates = jnp.full(SUBMAPS, rate)
-
-    def together():
+    def in_one_call() -> mapping.Learned:
         return mapping.refine_stack(*stack, steps, keys, camera, cfg, rates)[0]
 
     batched = jax.jit(jax.vmap(partial(mapping.descend, camera=camera, cfg=cfg), (0, 0, None, 0, 0)))
-    ways = {"one by one": one_by_one, "vmap": together}
+    ways = {"one by one": one_by_one, "vmap": in_one_call}
     if not devices:
         ways["all at once"] = lambda: batched(*stack, steps, keys, rates)[0]
     single, rows = one_by_one(), []

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from mipsjax.data.synth.scene import Scene
 
 CELL = 0.25  # metres
 FEWEST = 20  # vertices on a side
 PIECE = 1.0  # metres
-LEAST_CELLS = 5  # of a border, or a piece of it, whose median says something
+LEAST_CELLS = 3  # of a border or a piece whose median says something; a straight border has four in a piece
 FLAT_M = 0.005  # the scene's surface in a flat cell is a plane up to this
 FLAT_NORMAL = 0.98  # least length of the mean of its normals
 CHUNK = 20_000
@@ -44,6 +45,9 @@ class Step(NamedTuple):
 
     between: tuple[int, ...]
     """The submaps on either side; one where there is no border."""
+    facing: tuple[int, bool]
+    """Axis along which the surface's normal lies most, and whether against it: a shift of a submap raises steps of
+    opposite sign on opposite walls."""
     piece: tuple[int, ...]
     """Which cube of `PIECE` it is in."""
     cm: float
@@ -76,7 +80,9 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
     for members in _cells(vertices):
         if len(members) < 2 * FEWEST or not _flat(foot[members], off.normal[members]):
             continue
-        piece = tuple(np.floor(foot[members].mean(0) / PIECE).astype(int).tolist())
+        normal = off.normal[members].mean(0)
+        axis = int(np.argmax(np.abs(normal)))
+        where = (axis, bool(normal[axis] < 0)), tuple((foot[members].mean(0) // PIECE).astype(int).tolist())
         places, counts = np.unique(submap[members], return_counts=True)
         two = np.sort(places[np.argsort(counts, kind="stable")[-2:]])
         sides = [members[submap[members] == place] for place in two]
@@ -85,23 +91,26 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
             along = vertices[members] @ rng.standard_normal(3)
             order = members[np.argsort(along)]
             place = int(rng.integers(FEWEST, len(members) - FEWEST + 1))
-            steps["control"].append(Step(between, piece, _step(order[:place], order[place:], off)))
+            steps["control"].append(Step(between, *where, _step(order[:place], order[place:], off)))
         elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
-            steps["seam"].append(Step(between, piece, _step(*sides, off)))
+            steps["seam"].append(Step(between, *where, _step(*sides, off)))
     borders = _grouped(steps["seam"], lambda step: step.between)
+    sides = _grouped(steps["seam"], lambda step: (step.between, step.facing))
     row: dict[str, Any] = {
         "borders": len(borders),
         "worst_border_median_cm": max((_median(np.abs(b)) for b in borders), default=np.nan),
-        "worst_border_offset_cm": max((abs(_median(b)) for b in borders), default=np.nan),
+        "worst_border_offset_cm": max((abs(_median(side)) for side in sides), default=np.nan),
     }
-    for name, some in steps.items():
-        row |= {f"{name}_{key}": value for key, value in _summary(some).items()} if some else {}
+    for name, found in steps.items():
+        if found:
+            row |= {f"{name}_{key}": value for key, value in _summary(found).items()}
     return row
 
 
 def _summary(steps: list[Step]) -> dict[str, float]:
     sizes = np.abs([step.cm for step in steps])
-    pieces = [_median(np.abs(piece)) for piece in _grouped(steps, lambda step: (step.between, step.piece))]
+    pieces = _grouped(steps, lambda step: (step.between, step.piece))
+    medians = [_median(np.abs(piece)) for piece in pieces]
     return {
         "cells": len(sizes),
         "median_cm": _median(sizes),
@@ -109,8 +118,9 @@ def _summary(steps: list[Step]) -> dict[str, float]:
         "max_cm": float(sizes.max()),
         "over_1_cm": float(np.mean(sizes > 1)),
         "pieces": len(pieces),
-        "worst_piece_cm": max(pieces, default=np.nan),
-        "pieces_over_1_cm": int(np.sum(np.greater(pieces, 1))),
+        "cells_in_pieces": sum(map(len, pieces)),
+        "worst_piece_cm": max(medians, default=np.nan),
+        "pieces_over_1_cm": int(np.sum(np.greater(medians, 1))),
     }
 
 
@@ -122,12 +132,12 @@ def _grouped(steps: list[Step], by: Callable[[Step], Any]) -> list[list[float]]:
     return [group for group in groups.values() if len(group) >= LEAST_CELLS]
 
 
-def _median(values: Any) -> float:
+def _median(values: ArrayLike) -> float:
     return float(np.median(values))
 
 
 def _step(one: Int[np.ndarray, " A"], other: Int[np.ndarray, " B"], off: Errors) -> float:
-    """Centimetres between the median errors of two sets of vertices."""
+    """Centimetres by which the median error of the second set of vertices is above that of the first."""
     return 100 * (_median(off.signed[other]) - _median(off.signed[one]))
 
 

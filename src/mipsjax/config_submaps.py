@@ -39,7 +39,7 @@ class BackgroundConfig:
     steps: int = 10
     """Of local bundle adjustment on the anchor and random keyframes of the submap."""
     together: int = 1
-    """Submaps refined at once, as soon as so many are inactive; they are spread over devices."""
+    """Submaps refined in one call, as soon as so many are inactive; they are spread over devices."""
     executor: Literal["inline", "thread"] = "inline"
     """Where: between frames, or beside them. The results are the same to the bit."""
     rate: float = 0.3

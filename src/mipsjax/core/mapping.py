@@ -5,8 +5,9 @@ One entry point, `refine`, for the first fit, the active submap and the inactive
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -103,13 +104,26 @@ def refine(
     `rate` is a share of the networks' learning rate.
     Returns what was learned, the poses and an info; all as before where anything became infinite or NaN.
 
-    On a CPU `vmap` refines one submap after the other, to the same bits as alone. All at once their activations do not
-    stay in its cache, and sums are rounded otherwise, of which Adam makes whole steps where a gradient is about zero.
+    On a CPU `vmap` refines one submap after the other, to the same bits as alone. All at once, as elsewhere, their
+    activations would not stay in its cache, and sums would be rounded otherwise, of which Adam makes whole steps where
+    a gradient is about zero.
     """
     one = partial(descend, camera=camera, cfg=cfg)
-    if jax.default_backend() == "cpu":
-        one = jax.custom_batching.sequential_vmap(one)
-    return one(learned, frames, steps, key, jnp.asarray(rate))
+    return _in_turn_on_cpu(one)(learned, frames, steps, key, jnp.asarray(rate))
+
+
+def _in_turn_on_cpu(one: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function; on a CPU `vmap` calls it in turn."""
+    either = jax.custom_batching.custom_vmap(one)
+
+    @either.def_vmap
+    def rule(count, batched, *arguments):
+        axes = jax.tree.map(lambda yes: 0 if yes else None, tuple(batched))
+        in_turn, at_once = (jax.vmap(f, axes) for f in (jax.custom_batching.sequential_vmap(one), one))
+        out = jax.lax.platform_dependent(*arguments, cpu=in_turn, default=at_once)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return either
 
 
 def descend(
@@ -118,10 +132,11 @@ def descend(
     steps: Int[Array, ""],
     key: PRNGKeyArray,
     rate: Float[Array, ""],
+    *,
     camera: Intrinsics,
     cfg: Config,
 ) -> tuple[Learned, Float[Array, "F 4 4"], MapInfo]:
-    """What `refine` does, of which `vmap` is batched on any device."""
+    """`refine` without its rule for `vmap`."""
     pose_optimizer = optax.adam(cfg.map.pose_learning_rate)
 
     def step(i, carry):
@@ -155,7 +170,8 @@ def refine_stack(
 ) -> tuple[Learned, Float[Array, "S F 4 4"], MapInfo]:
     """`refine` of S submaps in one call: learned, frames, keys and rates have a leading axis of them.
 
-    That axis is spread over the devices, if S is a multiple of their number.
+    It is their `vmap`, so on a CPU they have the same bits as alone. That axis is spread over the devices, if S is a
+    multiple of their number.
     """
 
     @jax.vmap
