@@ -2,8 +2,9 @@
 
 A mesh is off by a little everywhere, most where things are small or were far away, so that two parts of it are off by
 different amounts whether a border runs between them or not. A seam is what a border adds to that. Two submaps that do
-not fit show it all along their border, or at least along a piece of it: so there are also medians of whole borders,
-with and without the sign, and of pieces, beside those of pieces without a border.
+not fit show it all along their border, or at least along a piece of it: so there are also medians of the sizes of steps
+of whole borders and of pieces, beside those of pieces without a border, and the offset of each border, which is the
+median with the sign of the steps in all that faces one way.
 
 Only flat cells count: walls, floors, table tops, where a step would show. There the signed error of both sides is that
 of one plane; elsewhere each side may hold another part of a chair.
@@ -46,8 +47,8 @@ class Step(NamedTuple):
     between: tuple[int, ...]
     """The submaps on either side; one where there is no border."""
     facing: tuple[int, bool]
-    """Axis along which the surface's normal lies most, and whether against it: a shift of a submap raises steps of
-    opposite sign on opposite walls."""
+    """Axis along which the surface's normal lies most, and whether against it: where a submap is shifted, opposite
+    walls have steps of opposite sign."""
     piece: tuple[int, ...]
     """Which cube of `PIECE` it is in."""
     cm: float
@@ -95,11 +96,13 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
         elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
             steps["seam"].append(Step(between, *where, _step(*sides, off)))
     borders = _grouped(steps["seam"], lambda step: step.between)
-    sides = _grouped(steps["seam"], lambda step: (step.between, step.facing))
+    offsets = [abs(_median(w)) for w in _grouped(steps["seam"], lambda step: (step.between, step.facing))]
     row: dict[str, Any] = {
         "borders": len(borders),
         "worst_border_median_cm": max((_median(np.abs(b)) for b in borders), default=np.nan),
-        "worst_border_offset_cm": max((abs(_median(side)) for side in sides), default=np.nan),
+        "facings": len(offsets),
+        "worst_offset_cm": max(offsets, default=np.nan),
+        "offsets_over_1_cm": int(np.sum(np.greater(offsets, 1))),
     }
     for name, found in steps.items():
         if found:
