@@ -87,7 +87,7 @@ def executors(frames: int, repeats: int, every: list[int]) -> None:
 
 
 def run(images: list, sequence: Sequence, cfg: Config) -> tuple[SlamState, float, float]:
-    """The end, and seconds by the clock and of both processors."""
+    """The end, and seconds by the clock and of processor time, all threads."""
     with executor(cfg.background.executor) as beside:
         # One config for all compiled code, whatever the executor
         cfg = changed(cfg, "background", executor="inline")
@@ -131,9 +131,9 @@ def stacks(devices: bool) -> None:
     def in_one_call() -> mapping.Learned:
         return mapping.refine_stack(*stack, steps, keys, camera, cfg, rates)[0]
 
-    batched = jax.jit(jax.vmap(partial(mapping.descend, camera=camera, cfg=cfg), (0, 0, None, 0, 0)))
     ways = {"one by one": one_by_one, "vmap": in_one_call}
     if not devices:
+        batched = jax.jit(jax.vmap(partial(mapping.descend, camera=camera, cfg=cfg), (0, 0, None, 0, 0)))
         ways["all at once"] = lambda: batched(*stack, steps, keys, rates)[0]
     single, rows = one_by_one(), []
     for name, way in ways.items():

@@ -83,7 +83,8 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
             continue
         normal = off.normal[members].mean(0)
         axis = int(np.argmax(np.abs(normal)))
-        where = (axis, bool(normal[axis] < 0)), tuple((foot[members].mean(0) // PIECE).astype(int).tolist())
+        facing = axis, bool(normal[axis] < 0)
+        piece = tuple((foot[members].mean(0) // PIECE).astype(int).tolist())
         places, counts = np.unique(submap[members], return_counts=True)
         two = np.sort(places[np.argsort(counts, kind="stable")[-2:]])
         sides = [members[submap[members] == place] for place in two]
@@ -92,9 +93,9 @@ def seams(vertices: Float[np.ndarray, "N 3"], submap: Int[np.ndarray, " N"], off
             along = vertices[members] @ rng.standard_normal(3)
             order = members[np.argsort(along)]
             place = int(rng.integers(FEWEST, len(members) - FEWEST + 1))
-            steps["control"].append(Step(between, *where, _step(order[:place], order[place:], off)))
+            steps["control"].append(Step(between, facing, piece, _step(order[:place], order[place:], off)))
         elif two.min() >= 0 and min(map(len, sides)) >= FEWEST:
-            steps["seam"].append(Step(between, *where, _step(*sides, off)))
+            steps["seam"].append(Step(between, facing, piece, _step(*sides, off)))
     borders = _grouped(steps["seam"], lambda step: step.between)
     offsets = [abs(_median(w)) for w in _grouped(steps["seam"], lambda step: (step.between, step.facing))]
     row: dict[str, Any] = {

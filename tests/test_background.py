@@ -1,4 +1,4 @@
-"""Which inactive submap is refined when, and several at once."""
+"""Which inactive submap is refined when, and several in one call."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_every_inactive_submap_has_its_turn():
     assert all(turn(frame, 1, 4, CFG) == () for frame in range(24) if frame % 4)
 
 
-def test_several_at_once_as_soon_as_there_are_so_many():
+def test_several_in_one_call_as_soon_as_there_are_so_many():
     both = replace(CFG, background=replace(CFG.background, together=2))
     assert turn(4, 0, 2, both) == (1,)
     assert [turn(frame, 1, 4, both) for frame in (4, 8, 12)] == [(3, 0), (2, 3), (0, 2)]
@@ -38,7 +38,7 @@ def test_nothing_to_refine():
     assert turn(4, 0, 3, replace(CFG, background=BackgroundConfig(steps=0))) == ()
 
 
-def test_several_at_once_become_what_they_become_one_by_one():
+def test_several_in_one_call_become_what_they_become_one_by_one():
     cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5, pose_rate=1.0))
     submaps = tuple(tilted(seed) for seed in (1, 2))
     together = refined(submaps, (3, 5), 40, maps.CAMERA, cfg)

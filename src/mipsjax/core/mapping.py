@@ -5,7 +5,7 @@ One entry point, `refine`, for the first fit, the active submap and the inactive
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -105,8 +105,8 @@ def refine(
     Returns what was learned, the poses and an info; all as before where anything became infinite or NaN.
 
     On a CPU `vmap` refines one submap after the other, to the same bits as alone. All at once, as elsewhere, their
-    activations would not stay in its cache, and sums would be rounded otherwise, of which Adam makes whole steps where
-    a gradient is about zero.
+    activations would not stay in its cache, and sums would be rounded otherwise: where a gradient is about zero, Adam
+    makes whole steps of the difference.
     """
     one = partial(descend, camera=camera, cfg=cfg)
     return _in_turn_on_cpu(one)(learned, frames, steps, key, jnp.asarray(rate))
@@ -117,7 +117,7 @@ def _in_turn_on_cpu(one: Callable[..., Any]) -> Callable[..., Any]:
     either = jax.custom_batching.custom_vmap(one)
 
     @either.def_vmap
-    def rule(count, batched, *arguments):
+    def rule(_: int, batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
         axes = jax.tree.map(lambda yes: 0 if yes else None, tuple(batched))
         in_turn, at_once = (jax.vmap(f, axes) for f in (jax.custom_batching.sequential_vmap(one), one))
         out = jax.lax.platform_dependent(*arguments, cpu=in_turn, default=at_once)
