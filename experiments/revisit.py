@@ -44,9 +44,9 @@ def unregistered() -> Iterator[None]:
     """Frames are linked to other submaps at the pose that was guessed, as if they had not been registered there."""
     original = territory.sight
 
-    def sight(state, place, keyframe, guess, cfg, measured=False):
-        found = original(state, place, keyframe, guess, cfg, measured)
-        return None if found is None else found._replace(T_sub_cam=guess)
+    def sight(state, place, keyframe, expected, cfg, measured=False):
+        found = original(state, place, keyframe, expected, cfg, measured)
+        return None if found is None else found._replace(T_sub_cam=expected.T_sub_cam)
 
     with replaced(territory, "sight", sight):
         yield

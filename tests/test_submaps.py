@@ -335,7 +335,9 @@ def another_room(frames) -> list[Frame]:
 
 def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(states, another_room, monkeypatch):
     # Boxes mean nothing there, even if what they hold should fit
-    monkeypatch.setattr(territory, "sight", lambda _, place, k, guess, cfg: Sighting(place, guess, 1.0))
+    monkeypatch.setattr(
+        territory, "sight", lambda _, place, k, guess, cfg: Sighting(place, guess.T_sub_cam, 1.0)
+    )
     lost_before = []
     monkeypatch.setattr(
         slam, "decide", lambda stats, cfg: lost_before.append(stats.lost) or decide(stats, cfg)

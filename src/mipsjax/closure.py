@@ -13,14 +13,14 @@ from mipsjax.host.registration import Match, relative_pose
 from mipsjax.links import Link, chain_distances, linked_pairs, links, misfit, unlinked
 from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_pose
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
-from mipsjax.territory import Sighting, link, sight
+from mipsjax.territory import Expected, Sighting, link, sight
 
 DEVIATIONS = 3.0  # standard deviations of a pose from features by which the field may correct it
 
 
 def prepare(state: SlamState, cfg: Config) -> None:
     """Compiles, on the first submap alone, what the first meeting of two submaps will need."""
-    sight(state, 0, state.submap.keyframes[0], np.eye(4), cfg)
+    sight(state, 0, state.submap.keyframes[0], Expected(np.eye(4)), cfg)
     if cfg.loop.enabled:
         surfaces.prepare(state.submap, state.camera, cfg)
 
@@ -42,20 +42,19 @@ def recognise(state: SlamState, keyframe: Keyframe, places: list[int], cfg: Conf
         seed = int(np.random.default_rng((cfg.seed, MATCH, keyframe.number, i)).integers(2**31))
         match = relative_pose(keyframe.features, database[i], state.camera, seed)
         if match.ok:
-            guess = other.T_sub_cam @ match.T_other_current
-            found = sight(state, place, keyframe, guess, cfg, measured=True)
-            if found is not None and _near(guess, found.T_sub_cam, match, cfg):
+            found = sight(state, place, keyframe, _expected(other, match, cfg), cfg, measured=True)
+            if found is not None:
                 return found
     return None
 
 
-def _near(guess: Pose, found: Pose, match: Match, cfg: Config) -> bool:
-    """The field puts the frame where the features do: things of one kind in two rooms match, the rooms do not."""
-    metres, radians = distance(guess, found)
+def _expected(other: Keyframe, match: Match, cfg: Config) -> Expected:
+    """Where the features put the frame. The field must too: things of one kind in two rooms match, the rooms do not."""
     loop = cfg.loop
-    return (
-        metres <= loop.sigma + DEVIATIONS * match.deviation_m
-        and radians <= loop.sigma_rotation + DEVIATIONS * match.deviation_rad
+    return Expected(
+        other.T_sub_cam @ match.T_other_current,
+        loop.sigma + DEVIATIONS * match.deviation_m,
+        loop.sigma_rotation + DEVIATIONS * match.deviation_rad,
     )
 
 

@@ -12,10 +12,10 @@ from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
-from mipsjax.links import joined
+from mipsjax.links import chain_distances, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
-from mipsjax.state import Keyframe, Pose, SlamState, Submap, inverse, rigid
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
 
 
 class Sighting(NamedTuple):
@@ -24,6 +24,19 @@ class Sighting(NamedTuple):
     submap: int
     T_sub_cam: Pose
     inliers: float
+
+
+class Expected(NamedTuple):
+    """Where a frame lies in a submap, before it is looked for there."""
+
+    T_sub_cam: Pose
+    metres: float = float("inf")
+    """By which this may be off."""
+    radians: float = float("inf")
+
+    def agrees(self, T_sub_cam: Pose) -> bool:
+        metres, radians = distance(self.T_sub_cam, T_sub_cam)
+        return metres <= self.metres and radians <= self.radians
 
 
 def begin(
@@ -54,33 +67,54 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
         state.active,
         box=volume.grow(state.submap.box, volume.moved(keyframe.T_sub_cam, p_cam), mask, cfg.volume),
     )
-    T_world_cam = state.submap.T_world_sub @ keyframe.T_sub_cam
     sightings, near = [], joined(state, state.active)
     for place, submap in enumerate(state.submaps):
-        guess = inverse(submap.T_world_sub) @ T_world_cam
-        inside = volume.contained(submap.box, volume.moved(guess, p_cam), mask)
-        if place == state.active or place not in near or inside < cfg.loop.overlap:
+        if place == state.active or place not in near:
             continue
-        found = sight(state, place, keyframe, guess, cfg)
+        there = expected(state, place, cfg)
+        inside = volume.contained(submap.box, volume.moved(there.T_sub_cam, p_cam), mask)
+        if inside < cfg.loop.overlap:
+            continue
+        found = sight(state, place, keyframe, there, cfg)
         if found is not None:
             state = link(state, keyframe, found)
             sightings.append(found)
     return state, sightings
 
 
-def sight(
-    state: SlamState, place: int, keyframe: Keyframe, guess: Pose, cfg: Config, measured: bool = False
-) -> Sighting | None:
-    """The frame in a submap, from a guess of its pose; None where it does not fit what the submap knows.
+def expected(state: SlamState, place: int, cfg: Config) -> Expected:
+    """Where the newest keyframe of the active submap lies in the submap at `place`.
 
-    Unless the guess was `measured`, as by image features, the surfaces must hold the frame in every direction.
+    Near along the chain the nearest frame that both share says so, up to what tracking may have drifted since: one
+    found elsewhere has slid along surfaces that hardly hold it. Across a loop the poses of the submaps say so, which
+    may be off by any amount.
+    """
+    keyframe, there, loop = state.submap.keyframes[-1], state.submaps[place], cfg.loop
+    shared = links(there, state.submap)
+    if not shared or chain_distances(state, state.active)[place] >= loop.apart:
+        return Expected(inverse(there.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
+    away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
+    nearest = min(range(len(shared)), key=away.__getitem__)
+    return Expected(
+        shared[nearest].T_first_second @ keyframe.T_sub_cam,
+        loop.sigma + loop.drift * away[nearest],
+        loop.sigma_rotation + loop.drift_rotation * away[nearest],
+    )
+
+
+def sight(
+    state: SlamState, place: int, keyframe: Keyframe, expected: Expected, cfg: Config, measured: bool = False
+) -> Sighting | None:
+    """The frame in a submap; None where it does not fit what the submap knows, or not where it was expected.
+
+    Unless that was `measured`, as by image features, the surfaces must hold the frame in every direction.
     """
     small = mapping_camera(state.camera, cfg)
     found = jax.device_get(
         tracking.register(
             state.submaps[place].learned.field,
             jnp.asarray(keyframe.depth),
-            jnp.asarray(guess, jnp.float32),
+            jnp.asarray(expected.T_sub_cam, jnp.float32),
             small,
             cfg,
         )
@@ -89,7 +123,7 @@ def sight(
     fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers
     if not measured:
         fits = fits and found.held >= loop.held
-    if not (np.isfinite(found.T_sub_cam).all() and fits):
+    if not (np.isfinite(found.T_sub_cam).all() and fits and expected.agrees(found.T_sub_cam)):
         return None
     return Sighting(place, rigid(found.T_sub_cam), float(found.inliers))
 
