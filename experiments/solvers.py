@@ -42,7 +42,8 @@ def with_optimistix(field: nf.Field, T: jax.Array, points: tracking.Points, cfg:
     def residuals(twist, _):
         moved = T @ jaxlie.SE3.exp(twist).as_matrix()
         psi = nf.tsdf(field, transform(moved, points.p_cam), cfg.field).psi
-        return points.mask * jnp.sqrt(tracking.robust_cost(psi, cfg.track.go.robust) + SMALLEST)
+        cost = tracking.robust_cost(psi, cfg.track.go.robust) + SMALLEST
+        return jnp.sqrt(tracking.precisions(points, cfg) * cost)
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
     found = optx.least_squares(

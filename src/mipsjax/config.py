@@ -23,6 +23,12 @@ class InputConfig:
     """Metres; nearer measurements count as none."""
     depth_max: float = 8.0
     """Metres; farther measurements count as none."""
+    noise_floor: float = 0.01
+    """Metres, standard deviation of depth measured close by, the map's own error among it."""
+    noise_growth: float = 0.002
+    """Metres, what a range of one metre adds to it, as for a structured-light camera; it grows with the square of the
+    range. Points count by the inverse variance in second-order tracking, and so do submaps in the blend. 0: all count
+    the same, as in the paper."""
     working_width: int = 320
     """Pixels; wider images are decimated by a whole factor to about this width before anything else."""
     max_bad_frames: int = 100

@@ -120,9 +120,5 @@ class BlendConfig:
     """The distance over several submaps (Eq. 1)."""
 
     entropy_floor: float = 0.3
-    """Nats; bounds the weight 1 / h^2 of a certain point."""
-    noise_floor: float = 0.005
-    """Metres, standard deviation of depth measured close by. A submap that measured a surface from nearer counts for
-    more, by the inverse variance; one that did not measure it counts for nothing. Not in the paper."""
-    noise_growth: float = 0.002
-    """Metres, the same at one metre; it grows with the square of the range. 0: it does not count, as in the paper."""
+    """Nats; bounds the weight 1 / h^2 of a certain point. A submap that measured a surface from nearer counts for more,
+    by the inverse variance of depth (`input.noise_growth`); one that did not measure it counts for nothing."""

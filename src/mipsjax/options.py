@@ -52,6 +52,8 @@ RIGHT_ANGLE = math.pi / 2
 RANGES: dict[str, Range] = {
     "input.depth_min": NOT_NEGATIVE,
     "input.depth_max": POSITIVE,
+    "input.noise_floor": POSITIVE,
+    "input.noise_growth": NOT_NEGATIVE,
     "input.working_width": Range(SMALLEST_IMAGE),
     "input.max_bad_frames": NOT_NEGATIVE,
     "field.truncation": POSITIVE,
@@ -168,8 +170,6 @@ RANGES: dict[str, Range] = {
     "correspond.max_gradient": POSITIVE,
     "correspond.max_angle": Range(0.0, RIGHT_ANGLE, above=True),
     "blend.entropy_floor": POSITIVE,
-    "blend.noise_floor": POSITIVE,
-    "blend.noise_growth": NOT_NEGATIVE,
     "mesh.voxel": Range(1e-3),
     "mesh.margin": POSITIVE,
     "mesh.band": POSITIVE,

@@ -6,6 +6,7 @@ from mipsjax.config import (
     Config,
     FieldConfig,
     GuardConfig,
+    InputConfig,
     KeyframeConfig,
     LossConfig,
     MapConfig,
@@ -15,7 +16,7 @@ from mipsjax.config import (
     SearchConfig,
     TrackConfig,
 )
-from mipsjax.config_submaps import BackgroundConfig, BlendConfig, LoopConfig, VolumeConfig
+from mipsjax.config_submaps import BackgroundConfig, LoopConfig, VolumeConfig
 from mipsjax.errors import ConfigError
 
 UNGUARDED = GuardConfig(
@@ -30,6 +31,7 @@ UNGUARDED = GuardConfig(
 is certain of nothing."""
 
 PAPER = Config(
+    input=InputConfig(noise_growth=0.0),
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     loss=LossConfig(cross_entropy=0.0, cross_entropy_free=0.0, color_samples=50),
@@ -53,7 +55,6 @@ PAPER = Config(
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
-    blend=BlendConfig(noise_growth=0.0),
 )
 TINY = Config(
     field=FieldConfig(

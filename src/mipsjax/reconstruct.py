@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Float64, Int
 
 from mipsjax.bundle import unprojected
 from mipsjax.config import Config
-from mipsjax.config_submaps import BlendConfig
 from mipsjax.core import blend, volume
+from mipsjax.core.losses import precision
 from mipsjax.host.meshing import extract
 from mipsjax.host.observed import Observed, observe, trust_at
 from mipsjax.state import Keyframe, SlamState, Submap, inverse
@@ -85,7 +85,7 @@ class Blend:
             np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
             for p, k in zip(points, submap.keyframes, strict=True)
         ]
-        trust = _trust(np.concatenate(ranges), self._cfg.blend)
+        trust = precision(np.concatenate(ranges), self._cfg.input)
         return observe(np.concatenate(points), trust, self._reach)
 
     def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:
@@ -124,9 +124,3 @@ class Blend:
                 T = jnp.asarray(T_sub_world @ middle, jnp.float32)
                 total = blend.add(total, submap.learned.field, T, jnp.asarray(trust), near, cfg, colored)
         return total
-
-
-def _trust(range_m: Float64[np.ndarray, " N"], cfg: BlendConfig) -> Float64[np.ndarray, " N"]:
-    """Inverse variance of depth measured from a range, 1 close by."""
-    noise = cfg.noise_growth * range_m**2 / cfg.noise_floor
-    return 1 / (1 + noise**2)

@@ -97,19 +97,36 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
 
     @jax.jit
     def derivatives(twist):
+        precision = tracking.precisions(points, cfg)
         # A saturated point costs, but is not to pull
         pulls = jnp.abs(psi(twist)) < tracking.SATURATED * CFG.field.truncation
-        some = points._replace(mask=points.mask & pulls)
-        gradient = jax.grad(lambda xi: tracking.map_system(corner_map.field, at(xi), some, part, cfg).cost)
-        weight = some.mask / (1 + (psi(twist) / cfg.track.go.robust) ** 2)
-        rows = jax.jacfwd(psi)(twist)
-        system = tracking.map_system(corner_map.field, T, points, part, cfg)
-        return system, gradient(twist), rows.T * weight[None] @ rows
 
-    system, gradient, hessian = derivatives(jnp.zeros(6))
-    # Sums of 768 float32 numbers in another order, of which those of the slope partly cancel
-    np.testing.assert_allclose(2 * system.slope, gradient, atol=1e-4 * np.abs(gradient).max())
-    np.testing.assert_allclose(system.hessian, hessian, atol=1e-4 * np.abs(hessian).max())
+        def costs(xi):
+            return precision * tracking.robust_cost(psi(xi), cfg.track.go.robust)
+
+        gradient = jax.grad(lambda xi: jnp.sum(pulls * costs(xi)))(twist)
+        weight = precision * pulls / (1 + (psi(twist) / cfg.track.go.robust) ** 2)
+        rows = jax.jacfwd(psi)(twist)
+        expected = tracking.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
+        return tracking.map_system(corner_map.field, T, points, part, cfg), expected
+
+    for found, expected in zip(*derivatives(jnp.zeros(6)), strict=True):
+        # Sums of 768 float32 numbers in another order, of which those of the slope partly cancel
+        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_points_count_by_the_noise_of_their_depth():
+    z = jnp.array([0.5, 1.0, 2.0, 4.0, 0.0])
+    points = tracking.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
+    found = np.asarray(tracking.precisions(points, CFG))
+    assert found[-1] == 0 and found[:4].mean() == pytest.approx(1)
+    noise = CFG.input.noise_growth * np.asarray(z[:4]) ** 2
+    variance = CFG.input.noise_floor**2 + noise**2
+    np.testing.assert_allclose(found[:4] * variance, found[0] * variance[0], rtol=1e-5)
+    even = replace(CFG, input=replace(CFG.input, noise_growth=0.0))
+    np.testing.assert_allclose(tracking.precisions(points, even), points.mask)
+    nothing = points._replace(mask=jnp.zeros(5, bool))
+    np.testing.assert_array_equal(tracking.precisions(nothing, CFG), 0)
 
 
 @pytest.mark.parametrize("axis", range(6))

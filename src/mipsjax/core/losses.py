@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import FieldConfig
+from mipsjax.config import FieldConfig, InputConfig
 from mipsjax.core.field import Tsdf, class_values
+
+Ranges = TypeVar("Ranges", np.ndarray, jax.Array)
 
 
 def masked_mean(values: Float[Array, "*S"], mask: Bool[Array, "*S"] | Float[Array, "*S"]) -> Float[Array, ""]:
@@ -19,6 +24,11 @@ def masked_mean(values: Float[Array, "*S"], mask: Bool[Array, "*S"] | Float[Arra
 def certainty(entropy: Float[Array, " P"], floor: float) -> Float[Array, " P"]:
     """Weight 1 / h^2 of a point (Eq. 13), bounded by a floor on the entropy and scaled to at most 1."""
     return floor**2 / (entropy**2 + floor**2)
+
+
+def precision(range_m: Ranges, cfg: InputConfig) -> Ranges:
+    """Inverse variance of depth measured from a range in metres, as a share of that close by."""
+    return 1 / (1 + (cfg.noise_growth * range_m**2 / cfg.noise_floor) ** 2)
 
 
 def d2t(psi: Float[Array, " P"], mask: Bool[Array, " P"]) -> Float[Array, ""]:

@@ -25,6 +25,7 @@ SATURATED = 0.95  # of the truncation: beyond it the field is flat and says noth
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
+SMALLEST = 1e-6  # mean precision, that of a frame without a measured point
 PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
@@ -91,6 +92,12 @@ def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: n
     return Fit(jnp.sqrt(cost), known, confirmed)
 
 
+def precisions(points: Points, cfg: Config) -> Float[Array, " P"]:
+    """Inverse variances of the points' depths, 1 in the mean of the measured ones and 0 elsewhere."""
+    inverse = losses.precision(points.p_cam[:, 2], cfg.input) * points.mask
+    return inverse / jnp.maximum(losses.masked_mean(inverse, points.mask), SMALLEST)
+
+
 class System(NamedTuple):
     """Cost, and the normal equations of one second-order step."""
 
@@ -111,18 +118,19 @@ def levenberg_marquardt(
 ) -> Float[Array, "4 4"]:
     """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
 
+    Points weigh by the noise of their depth: what is near says more, also of the rotation.
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement. Depth images of keyframes are a second term where `views` are given.
     """
-    go = cfg.track.go
+    go, precision = cfg.track.go, precisions(points, cfg)
 
     def from_view(T, errors):
         rows, narrow = _jacobian(T, points, errors.normal), go.view_robust
-        weight = go.view_weight * points.mask * errors.mask / (1 + (errors.distance / narrow) ** 2)
+        weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / narrow) ** 2)
         # A point that falls on nothing costs as much as one that is as far off as is allowed
         off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
-        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * points.mask)
+        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * precision)
 
     def system(T):
         total = map_system(field, T, points, part, cfg)
@@ -158,10 +166,11 @@ def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf
     go, scale = cfg.track.go, cfg.track.go.robust
     psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
     rows = _jacobian(T, points, pull(jnp.ones_like(psi))[0])
-    weight = points.mask * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
+    precision = precisions(points, cfg)
+    weight = precision * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
     if go.uncertainty:
         weight *= losses.certainty(entropy, go.entropy_floor)
-    return _system(psi, rows, weight, robust_cost(psi, scale) * points.mask)
+    return _system(psi, rows, weight, robust_cost(psi, scale) * precision)
 
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
