@@ -8,8 +8,9 @@ The first frames of a synthetic scene and the same backwards, so that submaps ar
 drift of the way between; `--once` for a scene that comes back to its beginning on its own. `full`: the frame with
 which a known submap takes over is registered in it, bundle adjustment follows (SR), and the pose graph is solved
 (LC); without SR, without LC, without both; `glued`: with a loop the camera goes over to the known submap at once, and
-all submaps stay where drift had put them; `none`: without SR, LC and registration, the pose in the known submap is what
-the world poses of the submaps say. With `--fork` all variants go on from one run of the first frames, as `full`.
+all submaps stay where drift had put them; `none`: without SR, LC and registration, the pose in the known submap is
+what is expected before the frame is looked for there. With `--fork` all variants go on from one run of the first
+frames, as `full`.
 
 RPE over one frame (translation, cm). Writes `revisit.csv`, a row each variant with the RPE in the 10 frames from a
 revisit on and elsewhere (after the fork), and a plot.
@@ -45,7 +46,7 @@ def unregistered() -> Iterator[None]:
     original = territory.sight
 
     def sight(state, place, keyframe, expected, cfg, measured=False):
-        found = original(state, place, keyframe, expected, cfg, measured)
+        found = original(state, place, keyframe, territory.Expected(expected.T_sub_cam), cfg, measured)
         return None if found is None else found._replace(T_sub_cam=expected.T_sub_cam)
 
     with replaced(territory, "sight", sight):

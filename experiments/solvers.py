@@ -43,7 +43,7 @@ def with_optimistix(field: nf.Field, T: jax.Array, points: tracking.Points, cfg:
         moved = T @ jaxlie.SE3.exp(twist).as_matrix()
         psi = nf.tsdf(field, transform(moved, points.p_cam), cfg.field).psi
         cost = tracking.robust_cost(psi, cfg.track.go.robust) + SMALLEST
-        return jnp.sqrt(tracking.precisions(points, cfg) * cost)
+        return jnp.sqrt(tracking.precisions(points, cfg)) * jnp.sqrt(cost)
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
     found = optx.least_squares(

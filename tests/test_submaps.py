@@ -336,7 +336,7 @@ def another_room(frames) -> list[Frame]:
 def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(states, another_room, monkeypatch):
     # Boxes mean nothing there, even if what they hold should fit
     monkeypatch.setattr(
-        territory, "sight", lambda _, place, k, guess, cfg: Sighting(place, guess.T_sub_cam, 1.0)
+        territory, "sight", lambda _, place, k, expected, cfg: Sighting(place, expected.T_sub_cam, 1.0)
     )
     lost_before = []
     monkeypatch.setattr(

@@ -12,7 +12,7 @@ from mipsjax.core import tracking
 from mipsjax.core.tracking import Registration
 from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, inverse
-from mipsjax.territory import expected, settle
+from mipsjax.territory import expect, settle
 
 CFG = PRESETS["tiny"]
 LOOP = CFG.loop
@@ -23,11 +23,11 @@ BENT = maps.pose((0.0, 1.0, 0.0), (0.03, 0.0, 0.0))
 
 @pytest.fixture
 def neighbours() -> SlamState:
-    """A submap begun from another at frame 3, two frames that both share, and frame 9, which only the new one has."""
-    ways = {3: 0.0, 7: 0.4, 9: 0.5}
+    """A submap begun from another at frame 3, three frames that both share, and frame 9, which only the new one has."""
+    ways = {3: 0.0, 7: 0.4, 8: 0.8, 9: 0.5}
     new = [maps.keyframe(n, maps.pose(translation=(x, 0.0, 0.0))) for n, x in ways.items()]
-    old = [maps.keyframe(0), new[0]._replace(T_sub_cam=T_OLD_NEW)]
-    old.append(new[1]._replace(T_sub_cam=T_OLD_NEW @ BENT @ new[1].T_sub_cam))
+    old = [maps.keyframe(0), *(k._replace(T_sub_cam=T_OLD_NEW @ k.T_sub_cam) for k in new[:3])]
+    old[2] = new[1]._replace(T_sub_cam=T_OLD_NEW @ BENT @ new[1].T_sub_cam)
     begun = maps.submap(*new, T_world_sub=T_OLD_NEW)._replace(parent=0)
     return maps.state(maps.submap(*old), begun, active=1)
 
@@ -35,7 +35,7 @@ def neighbours() -> SlamState:
 def test_the_nearest_shared_frame_says_where_one_lies_in_a_neighbour(neighbours):
     """Wherever the pose graph has put the two."""
     for T_world_old in (np.eye(4), maps.pose(translation=(0.1, 0.0, 0.0))):
-        said = expected(neighbours.with_submap(0, T_world_sub=T_world_old), 0, CFG)
+        said = expect(neighbours.with_submap(0, T_world_sub=T_world_old), 0, CFG)
         newest = neighbours.submap.keyframes[-1].T_sub_cam
         np.testing.assert_allclose(said.T_sub_cam, T_OLD_NEW @ BENT @ newest, atol=1e-12)
         assert said.metres == pytest.approx(LOOP.sigma + 0.1 * LOOP.drift)
@@ -50,7 +50,7 @@ def test_elsewhere_the_poses_of_the_submaps_say_it_and_may_be_off_by_anything(ne
     else:
         state = state.with_submap(0, keyframes=state.submaps[0].keyframes[:1])
     T_world_old = maps.pose(translation=(0.1, 0.0, 0.0))
-    said = expected(state.with_submap(0, T_world_sub=T_world_old), 0, cfg)
+    said = expect(state.with_submap(0, T_world_sub=T_world_old), 0, cfg)
     T_world_cam = state.submap.T_world_sub @ state.submap.keyframes[-1].T_sub_cam
     np.testing.assert_allclose(said.T_sub_cam, inverse(T_world_old) @ T_world_cam, atol=1e-12)
     assert said.agrees(maps.pose((90.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
@@ -68,12 +68,12 @@ def lands(monkeypatch, off: np.ndarray, held: float = 1.0) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(("share", "linked"), [(0.9, True), (1.1, False)])
 def test_a_frame_found_elsewhere_in_a_neighbour_is_not_linked(neighbours, monkeypatch, share, linked, turned):
-    said = expected(neighbours, 0, CFG)
+    said = expect(neighbours, 0, CFG)
     along = maps.pose(translation=(share * said.metres, 0.0, 0.0))
     lands(monkeypatch, maps.pose((0.0, np.degrees(share * said.radians), 0.0)) if turned else along)
     after, sightings = settle(neighbours, CFG)
     assert [sighting.submap for sighting in sightings] == [0] * linked
-    assert [k.number for k in after.submaps[0].keyframes] == [0, 3, 7] + [9] * linked
+    assert [k.number for k in after.submaps[0].keyframes] == [0, 3, 7, 8] + [9] * linked
 
 
 @pytest.mark.parametrize(("held", "linked"), [(2.0, True), (0.5, False)])

@@ -23,16 +23,22 @@ class InputConfig:
     """Metres; nearer measurements count as none."""
     depth_max: float = 8.0
     """Metres; farther measurements count as none."""
-    noise_floor: float = 0.01
-    """Metres, standard deviation of depth measured close by, the map's own error among it."""
-    noise_growth: float = 0.002
-    """Metres, what a range of one metre adds to it, as for a structured-light camera; it grows with the square of the
-    range. Points count by the inverse variance in second-order tracking, and so do submaps in the blend. 0: all count
-    the same, as in the paper."""
     working_width: int = 320
     """Pixels; wider images are decimated by a whole factor to about this width before anything else."""
     max_bad_frames: int = 100
     """Number of unusable frames after which a run stops with exit code 3."""
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """How depth errs: points count by its inverse variance in second-order tracking, submaps in the blend. Not in the
+    paper."""
+
+    noise_floor: float = 0.01
+    """Metres, standard deviation close by, with the map's own error."""
+    noise_growth: float = 0.002
+    """Metres, what the sensor adds at one metre, as for structured light; it grows with the square of the range. 0: all
+    points and submaps count the same, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -289,6 +295,7 @@ class Config:
     """All of it."""
 
     input: InputConfig = InputConfig()
+    sensor: SensorConfig = SensorConfig()
     field: FieldConfig = FieldConfig()
     sample: SampleConfig = SampleConfig()
     loss: LossConfig = LossConfig()

@@ -73,12 +73,14 @@ class LoopConfig:
     """How firmly the surfaces must hold the frame in every direction (`core/tracking.py: Registration.held`); furnished
     rooms have 4e-3 to 15e-3, a bare corridor 4e-6."""
     drift: float = 0.05
-    """Metres of drift for each metre from the anchor that a submap begun from another may hide: ten times what is
-    usual, since a true loop that comes after more drift than this would allow is rejected."""
+    """Metres of drift for each metre from the anchor that a submap begun from another may hide, and from a shared frame
+    to one that is to be linked to a neighbour: ten times what is usual, since a true loop that comes after more drift
+    than this would allow is rejected."""
     drift_rotation: float = 0.015
     """Radians of drift for each metre from the anchor."""
     sigma: float = 0.02
-    """Metres, of a frame that was registered in a submap, and of one at its anchor."""
+    """Metres, of a frame that was registered in a submap, and of one at its anchor. This and the drift are how far a
+    frame to be linked to a neighbour may be from where it is expected."""
     sigma_rotation: float = 0.005
     """Radians, the same."""
     fewest_points: int = 200
@@ -121,4 +123,4 @@ class BlendConfig:
 
     entropy_floor: float = 0.3
     """Nats; bounds the weight 1 / h^2 of a certain point. A submap that measured a surface from nearer counts for more,
-    by the inverse variance of depth (`input.noise_growth`); one that did not measure it counts for nothing."""
+    by the inverse variance of depth (`sensor`); one that did not measure it counts for nothing."""

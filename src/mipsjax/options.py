@@ -52,10 +52,10 @@ RIGHT_ANGLE = math.pi / 2
 RANGES: dict[str, Range] = {
     "input.depth_min": NOT_NEGATIVE,
     "input.depth_max": POSITIVE,
-    "input.noise_floor": POSITIVE,
-    "input.noise_growth": NOT_NEGATIVE,
     "input.working_width": Range(SMALLEST_IMAGE),
     "input.max_bad_frames": NOT_NEGATIVE,
+    "sensor.noise_floor": POSITIVE,
+    "sensor.noise_growth": NOT_NEGATIVE,
     "field.truncation": POSITIVE,
     "field.classes": Range(2, 64),
     "field.coldness": POSITIVE,

@@ -6,7 +6,6 @@ from mipsjax.config import (
     Config,
     FieldConfig,
     GuardConfig,
-    InputConfig,
     KeyframeConfig,
     LossConfig,
     MapConfig,
@@ -14,6 +13,7 @@ from mipsjax.config import (
     RefineConfig,
     SampleConfig,
     SearchConfig,
+    SensorConfig,
     TrackConfig,
 )
 from mipsjax.config_submaps import BackgroundConfig, LoopConfig, VolumeConfig
@@ -31,7 +31,7 @@ UNGUARDED = GuardConfig(
 is certain of nothing."""
 
 PAPER = Config(
-    input=InputConfig(noise_growth=0.0),
+    sensor=SensorConfig(noise_growth=0.0),
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     loss=LossConfig(cross_entropy=0.0, cross_entropy_free=0.0, color_samples=50),

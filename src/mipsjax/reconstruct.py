@@ -85,7 +85,7 @@ class Blend:
             np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
             for p, k in zip(points, submap.keyframes, strict=True)
         ]
-        trust = precision(np.concatenate(ranges), self._cfg.input)
+        trust = precision(np.concatenate(ranges), self._cfg.sensor)
         return observe(np.concatenate(points), trust, self._reach)
 
     def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:

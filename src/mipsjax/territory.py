@@ -31,8 +31,9 @@ class Expected(NamedTuple):
 
     T_sub_cam: Pose
     metres: float = float("inf")
-    """By which this may be off."""
+    """Farthest from there that it may be found."""
     radians: float = float("inf")
+    """The same, turned."""
 
     def agrees(self, T_sub_cam: Pose) -> bool:
         metres, radians = distance(self.T_sub_cam, T_sub_cam)
@@ -71,28 +72,28 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
     for place, submap in enumerate(state.submaps):
         if place == state.active or place not in near:
             continue
-        there = expected(state, place, cfg)
-        inside = volume.contained(submap.box, volume.moved(there.T_sub_cam, p_cam), mask)
+        expected = expect(state, place, cfg)
+        inside = volume.contained(submap.box, volume.moved(expected.T_sub_cam, p_cam), mask)
         if inside < cfg.loop.overlap:
             continue
-        found = sight(state, place, keyframe, there, cfg)
+        found = sight(state, place, keyframe, expected, cfg)
         if found is not None:
             state = link(state, keyframe, found)
             sightings.append(found)
     return state, sightings
 
 
-def expected(state: SlamState, place: int, cfg: Config) -> Expected:
+def expect(state: SlamState, place: int, cfg: Config) -> Expected:
     """Where the newest keyframe of the active submap lies in the submap at `place`.
 
     Near along the chain the nearest frame that both share says so, up to what tracking may have drifted since: one
-    found elsewhere has slid along surfaces that hardly hold it. Across a loop the poses of the submaps say so, which
-    may be off by any amount.
+    found elsewhere has slid along surfaces that hardly hold it. Across a loop, or where none is shared, the poses of
+    the submaps say so, which may be off by any amount.
     """
-    keyframe, there, loop = state.submap.keyframes[-1], state.submaps[place], cfg.loop
-    shared = links(there, state.submap)
+    keyframe, other, loop = state.submap.keyframes[-1], state.submaps[place], cfg.loop
+    shared = links(other, state.submap)
     if not shared or chain_distances(state, state.active)[place] >= loop.apart:
-        return Expected(inverse(there.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
+        return Expected(inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
     away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
     nearest = min(range(len(shared)), key=away.__getitem__)
     return Expected(
@@ -123,9 +124,10 @@ def sight(
     fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers
     if not measured:
         fits = fits and found.held >= loop.held
-    if not (np.isfinite(found.T_sub_cam).all() and fits and expected.agrees(found.T_sub_cam)):
+    if not (np.isfinite(found.T_sub_cam).all() and fits):
         return None
-    return Sighting(place, rigid(found.T_sub_cam), float(found.inliers))
+    T_sub_cam = rigid(found.T_sub_cam)
+    return Sighting(place, T_sub_cam, float(found.inliers)) if expected.agrees(T_sub_cam) else None
 
 
 def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:

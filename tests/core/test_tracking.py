@@ -120,10 +120,10 @@ def test_points_count_by_the_noise_of_their_depth():
     points = tracking.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
     found = np.asarray(tracking.precisions(points, CFG))
     assert found[-1] == 0 and found[:4].mean() == pytest.approx(1)
-    noise = CFG.input.noise_growth * np.asarray(z[:4]) ** 2
-    variance = CFG.input.noise_floor**2 + noise**2
+    noise = CFG.sensor.noise_growth * np.asarray(z[:4]) ** 2
+    variance = CFG.sensor.noise_floor**2 + noise**2
     np.testing.assert_allclose(found[:4] * variance, found[0] * variance[0], rtol=1e-5)
-    even = replace(CFG, input=replace(CFG.input, noise_growth=0.0))
+    even = replace(CFG, sensor=replace(CFG.sensor, noise_growth=0.0))
     np.testing.assert_allclose(tracking.precisions(points, even), points.mask)
     nothing = points._replace(mask=jnp.zeros(5, bool))
     np.testing.assert_array_equal(tracking.precisions(nothing, CFG), 0)

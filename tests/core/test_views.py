@@ -90,3 +90,13 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
     assert metres < 0.002 and degrees < 0.1  # the fresh networks pull a little at random
     none = Views(np.zeros((0, *depth.shape), np.float32), np.zeros((0, 4, 4), np.float32))
     assert apart(np.asarray(end(none)), TRUTH)[0] > 0.005, "without views nothing holds it"
+
+
+def test_points_say_as_much_as_their_precision(views, monkeypatch):
+    """To the map and to the views alike: without any, nothing moves the pose."""
+    monkeypatch.setattr(tracking, "precisions", lambda points, cfg: 0.0 * points.mask)
+    points = tracking.draw_points(KEY, *see(TRUTH), CFG.track.go.pixels, CAMERA)
+    start = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.01, 0, 0)), jnp.float32)
+    field, steps = nf.init(KEY, CFG.field), CFG.track.go.steps
+    end = tracking.levenberg_marquardt(field, start, points, "whole", steps, CFG, views, CAMERA)
+    np.testing.assert_array_equal(end, start)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import FieldConfig, InputConfig
+from mipsjax.config import FieldConfig, SensorConfig
 from mipsjax.core.field import Tsdf, class_values
 
-Ranges = TypeVar("Ranges", np.ndarray, jax.Array)
+Metres = TypeVar("Metres", np.ndarray, jax.Array)
 
 
 def masked_mean(values: Float[Array, "*S"], mask: Bool[Array, "*S"] | Float[Array, "*S"]) -> Float[Array, ""]:
@@ -26,9 +26,9 @@ def certainty(entropy: Float[Array, " P"], floor: float) -> Float[Array, " P"]:
     return floor**2 / (entropy**2 + floor**2)
 
 
-def precision(range_m: Ranges, cfg: InputConfig) -> Ranges:
-    """Inverse variance of depth measured from a range in metres, as a share of that close by."""
-    return 1 / (1 + (cfg.noise_growth * range_m**2 / cfg.noise_floor) ** 2)
+def precision(away: Metres, cfg: SensorConfig) -> Metres:
+    """Inverse variance of depths measured so many metres away, as shares of that close by. Not in the paper."""
+    return 1 / (1 + (cfg.noise_growth * away**2 / cfg.noise_floor) ** 2)
 
 
 def d2t(psi: Float[Array, " P"], mask: Bool[Array, " P"]) -> Float[Array, ""]:

@@ -25,7 +25,6 @@ SATURATED = 0.95  # of the truncation: beyond it the field is flat and says noth
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
-SMALLEST = 1e-6  # mean precision, that of a frame without a measured point
 PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
@@ -94,8 +93,9 @@ def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: n
 
 def precisions(points: Points, cfg: Config) -> Float[Array, " P"]:
     """Inverse variances of the points' depths, 1 in the mean of the measured ones and 0 elsewhere."""
-    inverse = losses.precision(points.p_cam[:, 2], cfg.input) * points.mask
-    return inverse / jnp.maximum(losses.masked_mean(inverse, points.mask), SMALLEST)
+    inverse = losses.precision(points.p_cam[:, 2], cfg.sensor) * points.mask
+    mean = losses.masked_mean(inverse, points.mask)
+    return inverse / jnp.where(mean > 0, mean, 1)
 
 
 class System(NamedTuple):
@@ -324,9 +324,9 @@ class Registration(NamedTuple):
     inliers: Float[Array, ""]
     """Share of those that are within `keyframe.error` of its surface."""
     held: Float[Array, ""]
-    """How firmly the surface holds the pose in the direction where it holds it least: mean square of metres of
-    distance for a metre, or a radian, of motion. Near 0 the frame slides or turns freely, as in a bare corridor, and
-    the guess says where it is."""
+    """How firmly the surface holds the pose in the direction where it holds it least: mean square, weighted as in
+    tracking, of metres of distance for a metre, or a radian, of motion. Near 0 the frame slides or turns freely, as in
+    a bare corridor, and the guess says where it is."""
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
