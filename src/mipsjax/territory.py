@@ -96,11 +96,8 @@ def expect(state: SlamState, place: int, cfg: Config) -> Expected:
         return Expected(inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
     away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
     nearest = min(range(len(shared)), key=away.__getitem__)
-    return Expected(
-        shared[nearest].T_first_second @ keyframe.T_sub_cam,
-        loop.sigma + loop.drift * away[nearest],
-        loop.sigma_rotation + loop.drift_rotation * away[nearest],
-    )
+    T_sub_cam = shared[nearest].T_first_second @ keyframe.T_sub_cam
+    return Expected(T_sub_cam, loop.sigma + loop.drift * away[nearest])
 
 
 def sight(
