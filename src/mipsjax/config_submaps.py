@@ -71,7 +71,7 @@ class LoopConfig:
     """Least share of these that must be within `keyframe.error` of its surface."""
     held: float = 3e-4
     """How firmly the surfaces must hold the frame in every direction (`core/tracking.py: Registration.held`); furnished
-    rooms have 4e-3 to 15e-3, a bare corridor 4e-6."""
+    rooms have 1e-3 to 6e-3, a bare corridor 4e-6."""
     drift: float = 0.05
     """Metres of drift for each metre from the anchor that a submap begun from another may hide, and from a shared frame
     to one that is to be linked to a neighbour: ten times what is usual, since a true loop that comes after more drift
