@@ -39,7 +39,8 @@ def test_nothing_to_refine():
 
 
 def test_several_in_one_call_become_what_they_become_one_by_one():
-    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5, pose_rate=1.0))
+    tiny = PRESETS["tiny"]
+    cfg = replace(tiny, background=BackgroundConfig(steps=5), map=replace(tiny.map, pose_learning_rate=1e-3))
     submaps = tuple(tilted(seed) for seed in (1, 2))
     together = refined(submaps, (3, 5), 40, maps.CAMERA, cfg)
     alone = [

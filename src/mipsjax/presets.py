@@ -38,7 +38,6 @@ PAPER = Config(
     map=MapConfig(
         steps=15,
         steps_slow=15,
-        pose_rate_slow=1.0,
         first_steps=500,
         submap_steps=500,
         final_steps=0,
@@ -53,7 +52,7 @@ PAPER = Config(
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
-    background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
+    background=BackgroundConfig(every_frames=1, rate=1.0),
     loop=LoopConfig(relocalise=False),
 )
 TINY = Config(
@@ -63,7 +62,6 @@ TINY = Config(
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
     loss=LossConfig(cross_entropy_free=3.0),
     map=MapConfig(
-        pose_learning_rate=1e-3,
         steps=4,
         steps_slow=4,
         first_steps=60,
