@@ -67,6 +67,17 @@ def test_at_no_rate_nothing_is_learned(count: int):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_poses_stay_to_the_bit_unless_they_have_a_rate(count: int):
+    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5))
+    submaps = tuple(tilted(seed) for seed in range(1, 1 + count))
+    for before, after in zip(
+        submaps, refined(submaps, tuple(range(count)), 40, maps.CAMERA, cfg), strict=True
+    ):
+        for a, b in zip(before.keyframes, after.keyframes, strict=True):
+            np.testing.assert_array_equal(a.T_sub_cam, b.T_sub_cam)
+
+
 def tilted(seed: int) -> Submap:
     """A submap that knows nothing, with views of a wall that is not parallel to the image."""
     slope = np.linspace(0, seed, maps.DEPTH.shape[1], dtype=np.float32)
