@@ -62,6 +62,7 @@ TINY = Config(
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
     loss=LossConfig(cross_entropy_free=3.0),
     map=MapConfig(
+        pose_learning_rate=1e-3,
         steps=4,
         steps_slow=4,
         first_steps=60,
