@@ -1,18 +1,17 @@
 """Scenes of many submaps: accuracy, loops, seams and memory, with parts of the method switched off.
 
     python experiments/large.py [--names corridor-loop+noise apartment+noise no-loop+noise living] [--seeds 0 1 2]
-                                [--switches full no-lc no-si no-sr frustum surface joint joint-no-lc]
-                                [--stride 1] [--no-surface]
+                                [--switches full no-lc no-si no-sr frustum surface] [--stride 1] [--no-surface]
 
 `living` is `small_house/living` of the development data. The switches are the paper's: no loop closure, no first fit
 of a new submap (SI), no bundle adjustment at a revisit (SR); `frustum` and `surface` are the other definitions of the
-volume that a submap governs; `joint` moves poses with the map, as the paper does, at a fifth of its rate. ATE RMSE
-after rigid alignment, over all frames. The mesh is moved by that same alignment. Accuracy is the mean distance of its
-vertices to the analytic scene; the sampled one and completeness by 1,000,000 points on each mesh. The reference is
-culled to what the sensor measured from within 5 m in every 10th frame. So is the mesh for the sampled accuracy, which
-drops what lies more than 2 cm behind the true surface and flatters it; for completeness the mesh is whole. Seams are
-measured where the scene is analytic (`seams.py`). Writes `large.csv`, a row a run, `large-memory.csv`, a row each new
-submap, and for each run the mesh, a picture of it, and a plan: trajectory and walls from above.
+volume that a submap governs. ATE RMSE after rigid alignment, over all frames. The
+mesh is moved by that same alignment. Accuracy is the mean distance of its vertices to the analytic scene; the sampled
+one and completeness by 1,000,000 points on each mesh. The reference is culled to what the sensor measured from within
+5 m in every 10th frame. So is the mesh for the sampled accuracy, which drops what lies more than 2 cm behind the true
+surface and flatters it; for completeness the mesh is whole. Seams are measured where the scene is analytic
+(`seams.py`). Writes `large.csv`, a row a run, `large-memory.csv`, a row each new submap, and for each run the mesh, a
+picture of it, and a plan: trajectory and walls from above.
 """
 
 from __future__ import annotations
@@ -43,14 +42,12 @@ from seams import errors, seams
 
 NAMES = ("corridor-loop+noise", "apartment+noise", "no-loop+noise", "living")
 SWITCHES = {
-    "full": {},
-    "no-lc": {"loop": {"enabled": False}},
-    "no-si": {"map": {"submap_steps": 0}},
-    "no-sr": {"map": {"revisit_steps": 0}},
-    "frustum": {"volume": {"governs": "frustum"}},
-    "surface": {"volume": {"governs": "surface"}},
-    "joint": {"map": {"pose_learning_rate": 2e-4}},
-    "joint-no-lc": {"map": {"pose_learning_rate": 2e-4}, "loop": {"enabled": False}},
+    "full": ("loop", {}),
+    "no-lc": ("loop", {"enabled": False}),
+    "no-si": ("map", {"submap_steps": 0}),
+    "no-sr": ("map", {"revisit_steps": 0}),
+    "frustum": ("volume", {"governs": "frustum"}),
+    "surface": ("volume", {"governs": "surface"}),
 }
 EVERY = 10  # frames whose depth decides what was seen
 SAMPLES = 1_000_000  # on each mesh
@@ -170,9 +167,8 @@ def main() -> None:
     for name, seed, switch in (
         (n, s, w) for n in options.names for s in options.seeds for w in options.switches
     ):
-        cfg, title = Config(), f"{name}-{seed}-{switch}"
-        for section, fields in SWITCHES[switch].items():
-            cfg = changed(cfg, section, **fields)
+        section, fields = SWITCHES[switch]
+        cfg, title = changed(Config(), section, **fields), f"{name}-{seed}-{switch}"
         watch = Memory({"sequence": name, "seed": seed, "switch": switch})
         done = run(source(name), cfg, frames=slice(0, None, options.stride), seed=seed, watch=watch)
         memory += watch.rows

@@ -39,7 +39,7 @@ def test_nothing_to_refine():
 
 
 def test_several_in_one_call_become_what_they_become_one_by_one():
-    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5))
+    cfg = replace(PRESETS["tiny"], background=BackgroundConfig(steps=5, pose_rate=1.0))
     submaps = tuple(tilted(seed) for seed in (1, 2))
     together = refined(submaps, (3, 5), 40, maps.CAMERA, cfg)
     alone = [
@@ -64,18 +64,6 @@ def test_at_no_rate_nothing_is_learned(count: int):
     ):
         for a, b in zip(*(jax.tree.leaves(s.learned.field) for s in (before, after)), strict=True):
             np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_poses_stay_to_the_bit_unless_they_have_a_rate(count: int):
-    tiny = PRESETS["tiny"]
-    cfg = replace(tiny, background=BackgroundConfig(steps=5), map=replace(tiny.map, pose_learning_rate=0.0))
-    submaps = tuple(tilted(seed) for seed in range(1, 1 + count))
-    for before, after in zip(
-        submaps, refined(submaps, tuple(range(count)), 40, maps.CAMERA, cfg), strict=True
-    ):
-        for a, b in zip(before.keyframes, after.keyframes, strict=True):
-            np.testing.assert_array_equal(a.T_sub_cam, b.T_sub_cam)
 
 
 def tilted(seed: int) -> Submap:

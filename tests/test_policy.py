@@ -87,7 +87,7 @@ def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
 
 def test_a_frame_with_hardly_any_depth_is_weak_and_teaches_nothing():
     few = PLAIN._replace(measured=0.049, translation=9.0)
-    assert decide(few, CFG) == Decision(Status.WEAK, keyframe=False, map_steps=0, tells=False)
+    assert decide(few, CFG) == Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
     assert decide(few._replace(known=0.1), CFG).status is Status.LOST
     assert decide(few._replace(measured=0.051), CFG).status is Status.OK
 

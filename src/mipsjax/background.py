@@ -52,9 +52,11 @@ def refined(
     keys = [jax.random.fold_in(random_key(cfg, BACKGROUND, number), place) for place in places]
     if len(submaps) == 1:
         (submap,), (some,), (key,) = submaps, chosen, keys
-        after = [refine(submap, some, work.steps, key, camera, cfg, work.rate)[0]]
+        after = [refine(submap, some, work.pose_rate, work.steps, key, camera, cfg, work.rate)[0]]
     else:
-        after = refine_together(list(submaps), chosen, work.steps, keys, camera, cfg, work.rate)
+        after = refine_together(
+            list(submaps), chosen, work.pose_rate, work.steps, keys, camera, cfg, work.rate
+        )
     return [submap._replace(learned=rested(submap.learned)) for submap in after]
 
 

@@ -71,14 +71,15 @@ def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
 def refine(
     submap: Submap,
     chosen: list[int],
+    share: float,
     steps: int,
     key: jax.Array,
     camera: Intrinsics,
     cfg: Config,
     rate: float = 1.0,
 ) -> tuple[Submap, bool]:
-    """`adjust` on some keyframes of a submap itself."""
-    batch, rates = _batch(submap, chosen, cfg)
+    """`adjust` on some keyframes of a submap itself, all but the anchor at a share of the pose rate."""
+    batch, rates = _batch(submap, chosen, share)
     learned, poses, ok = adjust(submap.learned, batch, rates, steps, key, camera, cfg, rate)
     return _taken_over(submap, chosen, learned, poses), ok
 
@@ -86,6 +87,7 @@ def refine(
 def refine_together(
     submaps: list[Submap],
     chosen: list[list[int]],
+    share: float,
     steps: int,
     keys: list[jax.Array],
     camera: Intrinsics,
@@ -93,7 +95,7 @@ def refine_together(
     rate: float = 1.0,
 ) -> list[Submap]:
     """`refine` of several submaps in one call, spread over the devices."""
-    parts = [_batch(submap, places, cfg) for submap, places in zip(submaps, chosen, strict=True)]
+    parts = [_batch(submap, places, share) for submap, places in zip(submaps, chosen, strict=True)]
     frames = [_frames(batch, rates) for batch, rates in parts]
     stack = jax.tree.map(
         lambda *leaves: jnp.stack(leaves),
@@ -139,13 +141,8 @@ def adjust(
     return learned, _poses(poses, batch, rates), bool(info.ok)
 
 
-def pose_rates(chosen: list[int], cfg: Config, share: float = 1.0) -> list[float]:
-    """Of the keyframes at some places of a submap: the share, or 0 for the anchor and for all where poses stay."""
-    return [share if i != 0 and cfg.map.pose_learning_rate else 0.0 for i in chosen]
-
-
-def _batch(submap: Submap, chosen: list[int], cfg: Config) -> tuple[list[Keyframe], list[float]]:
-    return [submap.keyframes[i] for i in chosen], pose_rates(chosen, cfg)
+def _batch(submap: Submap, chosen: list[int], share: float) -> tuple[list[Keyframe], list[float]]:
+    return [submap.keyframes[i] for i in chosen], [share if i != 0 else 0.0 for i in chosen]
 
 
 def _frames(batch: list[Keyframe], rates: list[float]) -> mapping.Frames:

@@ -138,9 +138,11 @@ class MapConfig:
     learning_rate: float = 1e-2
     momentum: float = 0.8
     """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
-    pose_learning_rate: float = 0.0
-    """Of the twist of each frame but the anchor, metres and radians (paper: 1e-3). At 0 poses stay as tracked: on noisy
-    depth their gradient turned the camera by 0.4 degrees in every submap, always the same way."""
+    pose_learning_rate: float = 5e-4
+    """Of the twist of each frame, metres and radians."""
+    pose_rate_slow: float = 0.0
+    """Share of that rate where the camera has hardly moved, and after the last frame: Adam's steps are as long as
+    its rate however small the gradient, and would shake poses that are known to a millimetre. 1 is the paper."""
     width_px: int = 160
     """Images are decimated to about this width for mapping; it bounds the memory of a keyframe."""
 

@@ -44,6 +44,8 @@ class BackgroundConfig:
     """Where: between frames, or beside them. The results are the same to the bit."""
     rate: float = 0.3
     """Share of the networks' learning rate; 1 is the paper, whose steps are too noisy to improve what is learned."""
+    pose_rate: float = 0.0
+    """Share of the pose learning rate (see `map.pose_rate_slow`); 1 is the paper."""
 
 
 @dataclass(frozen=True)

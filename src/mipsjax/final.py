@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mipsjax.background import taken_over
-from mipsjax.bundle import FINISH, MAP, adjust, pose_rates, random_key
+from mipsjax.bundle import FINISH, MAP, adjust, random_key
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.rest import rested
@@ -38,7 +38,8 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
         fresh = len(keyframes) < cfg.map.frames
         chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
         fall = 1 - call / calls
-        batch, rates = [keyframes[i] for i in chosen], pose_rates(chosen, cfg, fall)
+        rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
+        batch = [keyframes[i] for i in chosen]
         key = random_key(cfg, MAP, len(state.records) + call)
         learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, key, state.camera, cfg, fall)
         for i, pose in zip(chosen, poses, strict=True):

@@ -58,6 +58,8 @@ class Decision(NamedTuple):
     status: Status
     keyframe: bool
     map_steps: int
+    pose_rate: float
+    """Share of the pose learning rate in local bundle adjustment."""
     tells: bool
     """Its motion and residual say something about the frames to come."""
 
@@ -66,12 +68,13 @@ def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
     status = _status(stats, cfg)
     if status is Status.LOST or _is_sparse(stats, cfg):
-        return Decision(status, keyframe=False, map_steps=0, tells=False)
-    slow, share = cfg.map.steps_slow, _motion_share(stats, cfg)
+        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
+    share = _motion_share(stats, cfg)
     return Decision(
         status,
         keyframe=_is_keyframe(stats, cfg),
-        map_steps=round(slow + share * (cfg.map.steps - slow)),
+        map_steps=round(_between(cfg.map.steps_slow, cfg.map.steps, share)),
+        pose_rate=_between(cfg.map.pose_rate_slow, 1.0, share),
         tells=True,
     )
 
@@ -139,3 +142,7 @@ def _is_keyframe(stats: FrameStats, cfg: Config) -> bool:
 def _motion_share(stats: FrameStats, cfg: Config) -> float:
     """How fast the camera moves, 0 for a still one to 1 for one that deserves all effort."""
     return min(1.0, max(stats.step_translation, stats.step_rotation) / cfg.map.motion)
+
+
+def _between(slow: float, fast: float, share: float) -> float:
+    return slow + share * (fast - slow)

@@ -38,6 +38,7 @@ PAPER = Config(
     map=MapConfig(
         steps=15,
         steps_slow=15,
+        pose_rate_slow=1.0,
         first_steps=500,
         submap_steps=500,
         final_steps=0,
@@ -52,7 +53,7 @@ PAPER = Config(
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
-    background=BackgroundConfig(every_frames=1, rate=1.0),
+    background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
 )
 TINY = Config(

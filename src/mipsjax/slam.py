@@ -196,8 +196,10 @@ def _learn(
         current = (_keyframe if made else make_keyframe)(frame, number, T_sub_cam, cfg, state.camera)
         chosen = choose(state.submap, cfg.map.frames - 2, (cfg.seed, CHOOSE, number))
         batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
-        newest, key = len(batch.keyframes) - 1, random_key(cfg, MAP, number)
-        batch, ok = refine(batch, [newest, *chosen], decision.map_steps, key, state.camera, cfg)
+        steps, share = decision.map_steps, decision.pose_rate
+        newest = len(batch.keyframes) - 1
+        key = random_key(cfg, MAP, number)
+        batch, ok = refine(batch, [newest, *chosen], share, steps, key, state.camera, cfg)
         T_sub_cam = batch.keyframes[-1].T_sub_cam
         kept = batch if made else batch._replace(keyframes=batch.keyframes[:-1])
         state = state.with_submap(state.active, **kept._asdict())

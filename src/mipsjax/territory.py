@@ -173,8 +173,8 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
     if cfg.map.revisit_steps:
         known = submap._replace(keyframes=submap.keyframes[:-1])
         others = choose(known, cfg.map.frames - 2, (cfg.seed, INIT, number))
-        key = random_key(cfg, MAP, number)
-        submap, _ = refine(submap, [newest, *others], cfg.map.revisit_steps, key, state.camera, cfg)
+        share, key = cfg.map.pose_rate_slow, random_key(cfg, MAP, number)
+        submap, _ = refine(submap, [newest, *others], share, cfg.map.revisit_steps, key, state.camera, cfg)
     box = volume.grow(submap.box, *_seen(submap.keyframes[-1], state.camera, cfg), cfg.volume)
     return moved_in(state.with_submap(place, **submap._replace(box=box)._asdict()), place, newest)
 

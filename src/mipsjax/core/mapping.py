@@ -41,7 +41,7 @@ class Frames(NamedTuple):
     color: UInt8[Array, "F H W 3"]
     T_sub_cam: Float[Array, "F 4 4"]
     movable: Float[Array, " F"]
-    """Share of the pose learning rate at which the pose is optimised, if there is one; 0 for the anchor's."""
+    """Share of the pose learning rate at which the pose is optimised; 0 for the anchor's."""
 
 
 class Pixels(NamedTuple):
@@ -263,8 +263,6 @@ def _share_of_loss(
 ) -> Float[Array, ""]:
     """What a batch adds to the loss of the whole draw."""
     points = _points(moved(frames, twist), batch.frame, batch.pixels, batch.samples.depth)
-    if not cfg.map.pose_learning_rate:
-        points = jax.lax.stop_gradient(points)
     total, finest = jnp.zeros(()), None
     if field.smooth is not None:
         finest = nf.smooth_tsdf(field, points, cfg.field)
