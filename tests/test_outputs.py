@@ -27,7 +27,7 @@ from mipsjax.files import write_atomically
 from mipsjax.policy import Status
 from mipsjax.presets import preset
 from mipsjax.reconstruct import observed_points, reconstruct
-from mipsjax.state import FrameInfo, Record, SlamState, Submap
+from mipsjax.state import FrameInfo, Loop, Record, SlamState, Submap
 from mipsjax.summary import FrameRow, Run, metrics_content, verdict
 
 CFG = preset("tiny")
@@ -93,6 +93,19 @@ def test_metrics_count_what_happened(run: Run) -> None:
     assert content["fps"] is None, "two usable frames, and both compile"
     assert content["fps_overall"] == pytest.approx(4 / 1.2)
     assert content["te_mean_m"] > 0 and content["seconds"] >= 2.2
+    assert (content["submaps"], content["unjoined_submaps"]) == (1, [])
+
+
+def test_metrics_name_loops_and_submaps_that_hang_on_nothing(run: Run) -> None:
+    assert run.state is not None
+    (submap,) = run.state.submaps
+    later = submap._replace(keyframes=(submap.keyframes[0]._replace(number=2),))
+    loops = tuple(Loop(2, 0, 1, "box", 0.9, 0.1, 0.0, weight) for weight in (0.0, 1.0))
+    state = run.state._replace(submaps=(submap, later, submap), loops=loops)
+    content = metrics_content(run._replace(state=state), None, {})
+    assert (content["submaps"], content["unjoined_submaps"]) == (3, [1])
+    assert content["loops"] == 1 and content["loops_found"] == outputs.loops_content(state)["loops"]
+    assert [row["weight"] for row in content["loops_found"]] == [0, 1]
 
 
 def test_speed_is_that_of_usable_frames_after_the_two_that_compile(run: Run) -> None:

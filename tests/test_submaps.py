@@ -333,7 +333,9 @@ def another_room(frames) -> list[Frame]:
     ]
 
 
-def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(states, another_room, monkeypatch):
+def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(
+    states, another_room, monkeypatch, caplog
+):
     # Boxes mean nothing there, even if what they hold should fit
     monkeypatch.setattr(
         territory, "sight", lambda _, place, k, expected, cfg: Sighting(place, expected.T_sub_cam, 1.0)
@@ -363,6 +365,13 @@ def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(states, an
     assert len(after.submaps) == 3 and after.active == 2 and after.submap.parent is None
     np.testing.assert_allclose(after.submap.T_world_sub, world_pose(before, before.records[-1]), atol=1e-9)
     assert joined(after, 2) == {2} and joined(after, 0) == {0, 1} and after.loops == ()
+    go = replace(CFG.track.go, final_steps=0)
+    idle = replace(CFG, map=replace(CFG.map, final_steps=0), track=replace(CFG.track, go=go))
+    finish(before, idle)
+    assert not caplog.records
+    finish(after, idle)
+    (warning,) = caplog.messages
+    assert "submaps [2]" in warning and "guess" in warning
 
 
 @pytest.mark.parametrize("place", [0, 1])

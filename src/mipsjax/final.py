@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,9 +11,12 @@ from mipsjax.background import taken_over
 from mipsjax.bundle import FINISH, MAP, adjust, random_key
 from mipsjax.config import Config
 from mipsjax.core import tracking
+from mipsjax.links import unjoined
 from mipsjax.rest import rested
 from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import THUMBNAIL_UNIT, Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride
+
+log = logging.getLogger(__name__)
 
 BATCH_STEPS = 10  # of mapping on each random batch of keyframes
 ALIGNED = 16  # frames in one call of `tracking.align`
@@ -19,13 +24,19 @@ ALIGNED = 16  # frames in one call of `tracking.align`
 
 def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
     """The state after the last frame: `map.final_steps` steps of mapping of each submap, then `track.go.final_steps`
-    of tracking of each frame. `executor` is the one that `step` was given."""
+    of tracking of each frame. `executor` is the one that `step` was given. Warns where submaps hang on
+    nothing."""
     state = taken_over(state, executor)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":
         for place in range(len(state.submaps)):
             state = _aligned(state, place, cfg)
+    if apart := unjoined(state):
+        log.warning(
+            "submaps %s, begun by a lost camera, were never seen to overlap the first: where they lie is a guess",
+            apart,
+        )
     return state
 
 

@@ -51,6 +51,11 @@ def joined(state: SlamState, start: int) -> set[int]:
     return set(_steps(len(state.submaps), linked_pairs(state), start))
 
 
+def unjoined(state: SlamState) -> list[int]:
+    """Submaps that no shared frames connect with the first: where they lie is where a lost camera was seen last."""
+    return sorted(set(range(len(state.submaps))) - joined(state, 0))
+
+
 def chain_distances(state: SlamState, start: int) -> list[float]:
     """Steps along the chain from one submap to each, each step from a submap to one that was begun from it or back.
 

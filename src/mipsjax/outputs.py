@@ -32,7 +32,7 @@ from mipsjax.host.picture import save_picture, up_direction
 from mipsjax.options import to_dict
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, SlamState, trajectory
-from mipsjax.summary import SCHEMA_VERSION, FrameRow, Run, metrics_content, verdict
+from mipsjax.summary import SCHEMA_VERSION, FrameRow, Run, loop_rows, metrics_content, verdict
 
 try:
     import fcntl
@@ -162,21 +162,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def loops_content(state: SlamState) -> dict[str, Any]:
-    """Every loop that was found, in order: between which submaps, how, and what became of it."""
-    loops = [
-        {
-            "index": state.records[loop.frame].frame,
-            "timestamp": state.records[loop.frame].timestamp,
-            "submaps": [loop.first, loop.second],
-            "how": loop.how,
-            "inliers": loop.inliers,
-            "weight": loop.weight,
-            "correction_cm": 100 * loop.correction_m,
-            "correction_deg": math.degrees(loop.correction_rad),
-        }
-        for loop in state.loops
-    ]
-    return {"schema_version": SCHEMA_VERSION, "loops": loops}
+    """Every loop that was found, kept or not."""
+    return {"schema_version": SCHEMA_VERSION, "loops": loop_rows(state)}
 
 
 def status_csv(rows: tuple[FrameRow, ...]) -> str:

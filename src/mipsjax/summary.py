@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Callable
 from time import perf_counter
@@ -15,6 +16,7 @@ from mipsjax.data.sequence import Sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import InputError
 from mipsjax.host import metrics, surface
+from mipsjax.links import unjoined
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, SlamState, keyframes, map_bytes, trajectory
 
@@ -119,8 +121,10 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
         "seconds_per_stage": stages,
         "peak_memory_bytes": _peak_memory(),
         "submaps": len(run.state.submaps),
+        "unjoined_submaps": unjoined(run.state),
         "keyframes": keyframes(run.state),
         "loops": sum(loop.weight > 0 for loop in run.state.loops),
+        "loops_found": loop_rows(run.state),
         "status_counts": {str(status): [row.status for row in rows].count(status) for status in Status},
         "ro_frames": sum(row.info.searched for row in rows),
         "map_bytes": map_bytes(run.state),
@@ -132,6 +136,23 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
         **{name: number.value for name, number in numbers.items()},
         "protocol": {name: number.protocol for name, number in numbers.items()},
     }
+
+
+def loop_rows(state: SlamState) -> list[dict[str, Any]]:
+    """Every loop that was found, in order: between which submaps, how, and what became of it."""
+    return [
+        {
+            "index": state.records[loop.frame].frame,
+            "timestamp": state.records[loop.frame].timestamp,
+            "submaps": [loop.first, loop.second],
+            "how": loop.how,
+            "inliers": loop.inliers,
+            "weight": loop.weight,
+            "correction_cm": 100 * loop.correction_m,
+            "correction_deg": math.degrees(loop.correction_rad),
+        }
+        for loop in state.loops
+    ]
 
 
 def trajectory_errors(run: Run) -> dict[str, Number]:

@@ -1,20 +1,19 @@
-"""Boxes of submaps: growth within a limit, what a frame sees, shares of points and of volume."""
+"""Boxes of submaps: growth within a limit, what a frame sees, shares of points."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import permutations, product
 
 import numpy as np
 import pytest
-from corner import CAMERA, HOME, pose, see
+from corner import CAMERA, HOME, see
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mipsjax.config_submaps import VolumeConfig
 from mipsjax.core import volume
-from mipsjax.core.volume import Box, boxes_overlap, contained, grow, inside, moved, seen
+from mipsjax.core.volume import Box, contained, grow, inside, moved, seen
 
 CFG = VolumeConfig(governs="depth", far=5.0, max_side=7.0, margin=0.0)
 ROUNDING = 1e-12  # metres; coordinates are below 100 m, with 2e-14 in the last place
@@ -23,7 +22,6 @@ POINTS = arrays(np.float64, (COUNT, 3), elements=st.floats(-10, 10))
 NEAR_POINTS = arrays(np.float64, (COUNT, 3), elements=st.floats(-3, 3))
 MASK = arrays(np.bool_, COUNT)
 ALL = np.ones(COUNT, bool)
-CORNERS = np.array(list(product((0, 1), repeat=3)), float)
 
 
 def sides(box: Box) -> np.ndarray:
@@ -155,66 +153,3 @@ def test_beyond_the_far_plane_depth_is_cut_and_surface_is_none():
     assert not seen(depth, CAMERA, replace(CFG, governs="surface")).mask.any()
     cut = seen(depth, CAMERA, replace(CFG, governs="depth"))
     assert cut.mask.all() and cut.p_cam[:, 2].max() == 5.0
-
-
-def random_box(rng: np.random.Generator) -> Box:
-    lo = rng.uniform(-3, 3, 3)
-    return Box(lo, lo + rng.uniform(0.5, 5, 3))
-
-
-def random_pose(rng: np.random.Generator) -> np.ndarray:
-    return pose(rng.normal(0, 60, 3), rng.uniform(-2, 2, 3))
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_overlap_is_a_share_and_whole_with_itself(seed):
-    rng = np.random.default_rng(seed)
-    a, b, T_a_b = random_box(rng), random_box(rng), random_pose(rng)
-    assert 0 <= boxes_overlap(a, T_a_b, b) <= 1
-    assert boxes_overlap(b, np.eye(4), b) == 1
-    around = moved(T_a_b, b.lo + CORNERS * sides(b))
-    assert boxes_overlap(Box(around.min(0), around.max(0)), T_a_b, b) == 1
-    assert boxes_overlap(a, pose((0, 0, 0), (100, 0, 0)) @ T_a_b, b) == 0
-
-
-@given(st.integers(0, 2**32 - 1), st.sampled_from(list(permutations(range(3)))))
-def test_overlap_is_the_same_after_a_rigid_motion_of_either_frame(seed, order):
-    """Shifts and quarter turns, which leave a box parallel to the axes."""
-    rng = np.random.default_rng(seed)
-    a, b, T_a_b = random_box(rng), random_box(rng), random_pose(rng)
-    T = np.eye(4)
-    T[:3, :3] = np.eye(3)[list(order)] * rng.choice([-1, 1], 3)
-    T[:3, 3] = rng.uniform(-9, 9, 3)
-
-    def turned(box):
-        ends = moved(T, np.stack(box))
-        return Box(ends.min(0), ends.max(0))
-
-    # A sample that lies on a face to the last bit may change sides; with random numbers none does
-    before = boxes_overlap(a, T_a_b, b)
-    assert boxes_overlap(turned(a), T @ T_a_b, b) == before
-    assert boxes_overlap(a, T_a_b @ np.linalg.inv(T), turned(b)) == before
-
-
-@given(st.lists(st.integers(0, 8), min_size=3, max_size=3))
-def test_overlap_of_shifted_boxes_in_closed_form(cells):
-    """Shifts by whole cells of the sample: the share is the product of what is left of each side."""
-    b = Box(np.array([0.1, 0.2, -0.3]), np.array([1.7, 3.4, 1.3]))
-    T_a_b = pose((0, 0, 0), np.array(cells) / 8 * sides(b))
-    assert boxes_overlap(b, T_a_b, b) == pytest.approx(np.prod(1 - np.array(cells) / 8))
-
-
-def test_overlap_of_turned_boxes_against_many_random_points():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        a, b, T_a_b = random_box(rng), random_box(rng), random_pose(rng)
-        draws = moved(T_a_b, b.lo + rng.random((20000, 3)) * sides(b))
-        exact = np.mean(np.all((draws > a.lo) & (draws < a.hi), 1))
-        # 512 even samples: a plane through them leaves up to half a layer of 8 uncertain at each face
-        assert boxes_overlap(a, T_a_b, b) == pytest.approx(exact, abs=0.06)
-
-
-def test_a_box_without_volume_is_a_point():
-    point = Box(np.ones(3), np.ones(3))
-    assert boxes_overlap(Box(np.zeros(3), np.full(3, 2.0)), np.eye(4), point) == 1
-    assert boxes_overlap(point, np.eye(4), Box(np.zeros(3), np.full(3, 2.0))) == 0

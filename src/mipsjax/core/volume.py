@@ -1,4 +1,4 @@
-"""The box that a submap governs: what a keyframe sees, growth, containment and overlap.
+"""The box that a submap governs: what a keyframe sees, growth and containment.
 
 Plain NumPy in double precision: it runs on the host, a few times a frame, with some hundred points. Boxes and
 points are in a submap's frame, metres; a box is closed, so that a point on a face is inside.
@@ -18,8 +18,6 @@ ROWS, COLUMNS = 12, 16
 """Pixels of an image whose rays stand for it: a step of about 4 degrees for a common depth camera."""
 DEPTHS = 8
 """Points on a ray: about 60 cm apart up to 5 m, a tenth of the largest box."""
-CELLS = 8
-"""Along each side of a box whose volume is compared: a share of it is known to about a hundredth."""
 
 
 class Box(NamedTuple):
@@ -109,13 +107,6 @@ def contained(box: Box, points: Float64[np.ndarray, "M 3"], mask: Bool[np.ndarra
     """
     points = _usable(points, mask)
     return float(inside(box, points).mean()) if len(points) else 1.0
-
-
-def boxes_overlap(box_a: Box, T_a_b: Float64[np.ndarray, "4 4"], box_b: Box) -> float:
-    """Share of box b's volume that is in box a, 0..1, by the centres of `CELLS`^3 equal cells of b."""
-    even = (np.arange(CELLS) + 0.5) / CELLS
-    unit = np.stack(np.meshgrid(even, even, even, indexing="ij"), -1).reshape(-1, 3)
-    return float(inside(box_a, moved(T_a_b, box_b.lo + unit * (box_b.hi - box_b.lo))).mean())
 
 
 def _grid(camera: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
