@@ -83,11 +83,14 @@ class Refinement(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Between the last two trusted frames."""
+    """Of the camera at the last trusted frame, as twists (v, omega) in its own frame."""
 
-    T_older_newer: Pose
-    """Camera to camera."""
+    velocity: Float64[np.ndarray, "6"]
+    """Metres and radians a second."""
+    covariance: Float64[np.ndarray, "12 12"]
+    """Of the pose, metres and radians, then of the velocity."""
     seconds: float
+    """Since the trusted frame before."""
 
 
 class FrameInfo(NamedTuple):
