@@ -16,7 +16,7 @@ from mipsjax.data.synth import open_synth
 from mipsjax.final import finish
 from mipsjax.policy import Status
 from mipsjax.presets import PRESETS
-from mipsjax.state import SlamState, trajectory
+from mipsjax.state import Motion, SlamState, trajectory
 
 CFG = PRESETS["tiny"]
 FRAMES = 6
@@ -168,11 +168,10 @@ def test_the_least_residual_falls_at_once_and_rises_slowly(finished, frames):
     assert 0.3 * last < low.residual < 0.3 * last + 0.1 * (below - 0.3 * last)
 
 
-def test_the_motion_is_learned_from_the_trusted_frames(finished, frames):
-    between = np.linalg.inv(trajectory(finished)[-2]) @ trajectory(finished)[-1]
+def test_the_motion_is_that_between_the_last_trusted_frames(finished, frames):
+    poses = trajectory(finished)
     assert finished.motion is not None
-    step = finished.motion.velocity[:3] * finished.motion.seconds
-    assert np.linalg.norm(step - between[:3, 3]) < 0.3 * np.linalg.norm(between[:3, 3])
+    np.testing.assert_allclose(finished.motion.T_older_newer, np.linalg.inv(poses[-2]) @ poses[-1], atol=1e-9)
     blind = slam.step(finished, frames[0]._replace(depth=None, problem="gone"), CFG)
     assert blind.motion is finished.motion, "nothing was learned about it"
 
@@ -187,6 +186,26 @@ def test_a_frame_with_hardly_any_depth_teaches_nothing(finished, frames):
     assert record.info.note.startswith("depth in ") and record.info.note.endswith(" % of the pixels only")
     assert same_map(after, finished) and after.trouble == 1
     assert after.residual == before.residual and after.motion is before.motion
+
+
+@pytest.mark.parametrize(
+    ("intervals", "steps"), [(1.0, 1.0), (2.5, 2.5), (100.0, 5.0), (0.0, 0.0), (-3.0, 0.0)]
+)
+def test_the_motion_goes_on_for_the_time_that_has_passed(finished, intervals, steps):
+    """At the same speed, but not over a long gap, and not backwards in time."""
+    motion = Motion(translated(0.02), 1 / 30)
+    state = finished._replace(motion=motion)
+    last = trajectory(finished)[-1]
+    now = finished.records[-1].timestamp + intervals / 30
+    moving, still = slam._candidates(state, now)
+    np.testing.assert_allclose(moving, last @ translated(0.02 * steps), atol=1e-9)
+    np.testing.assert_allclose(still, last, atol=1e-12)
+
+
+def translated(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
 
 
 def test_memory_grows_by_a_small_record_a_frame(finished, frames):

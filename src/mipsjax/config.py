@@ -221,15 +221,6 @@ class RefineConfig:
     """Points are weighted by their uncertainty, with `lm`; the paper does so in RO only."""
     entropy_floor: float = 0.3
     """Nats; bounds that weight of a certain point."""
-    motion: bool = True
-    """With `lm`, frames stay near where the motion of the camera puts them, the more the less surfaces hold them; off,
-    as in the paper, it only says where to begin."""
-    acceleration: float = 1.0
-    """Metres per second by which the camera's velocity may wander in a second (standard deviation)."""
-    angular_acceleration: float = 2.0
-    """Radians per second, the same."""
-    effective_points: float = 300.0
-    """As how many independent ones the points count beside the motion."""
     views: int = 3
     """Keyframes near the last pose to whose depth images a frame is aligned as well, with `lm`; 0 is none, as in
     the paper. They hold a new view before the networks have learned it."""

@@ -11,6 +11,7 @@ from time import perf_counter
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mipsjax.background import refine_inactive, taken_over
 from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine
@@ -21,19 +22,20 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.motion import Prediction, predict, update
 from mipsjax.policy import STAY, Decision, FrameStats, Status, converged, decide, widening
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import (
     FrameInfo,
     Keyframe,
+    Motion,
     Pose,
     Record,
     SlamState,
     distance,
     inverse,
     last_pose,
+    pose_of,
     rigid,
     thumbnail,
 )
@@ -41,6 +43,8 @@ from mipsjax.territory import begin, enter, govern, settle
 
 ANCHOR_MEASURED = 0.1
 """Share of pixels with depth that the first frame of a map needs."""
+DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
+DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 RESIDUAL_RISE = 0.02  # share of a frame's excess by which the least residual of late goes up
 
 
@@ -84,8 +88,7 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
     began = perf_counter()
-    predicted = predict(state.motion, frame.timestamp - _last_trusted(state).timestamp, cfg.track.go)
-    T_sub_cam, info = _track(state, frame, predicted, cfg)
+    T_sub_cam, info = _track(state, frame, cfg)
     track_ms = _ms(began)
     stats = _stats(state, frame.depth, T_sub_cam, info)
     decision = decide(stats, cfg)
@@ -95,11 +98,7 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     if not decision.tells:
         frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
-    if decision.tells:
-        motion = update(predicted, inverse(last_pose(state)) @ T_sub_cam, info.information.astype(np.float64))
-        floor = _least(state.residual, float(info.after.residual))
-        learned = learned._replace(motion=motion, residual=floor)
-    state = learned
+    state = _moved_on(learned, state, float(info.after.residual)) if decision.tells else learned
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
     return refine_inactive(state, cfg, executor)
@@ -142,27 +141,20 @@ def _recover(
     return place.state._replace(records=(*state.records, record), trouble=1, motion=None)
 
 
-def _track(
-    state: SlamState, frame: Frame, predicted: Prediction, cfg: Config
-) -> tuple[Pose, tracking.TrackInfo]:
-    """From where the motion puts the frame, or where the last one was."""
+def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.TrackInfo]:
     assert frame.depth is not None
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
-    last = last_pose(state)
-    candidates = np.stack([last @ predicted.T_last_next, last]).astype(np.float32)
-    precision = predicted.precision.astype(np.float32)
     T, info = tracking.track(
         state.submap.learned.field,
         frame.depth,
         color,
-        candidates,
+        np.stack(_candidates(state, frame.timestamp)).astype(np.float32),
         np.float32(widening(state.trouble, cfg)),
         random_key(cfg, TRACK, len(state.records)),
         state.camera,
         cfg,
         _views(state, cfg),
         np.float32(converged(state.residual, cfg)),
-        tracking.Prior(jnp.asarray(candidates[0]), jnp.asarray(precision)) if cfg.track.go.motion else None,
     )
     T, info = jax.device_get((T, info))
     return rigid(T), info
@@ -250,14 +242,36 @@ def _coast(
     return state._replace(records=(*state.records, record), trouble=state.trouble + 1)
 
 
+def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
+    """Constant velocity over the real time since the last trusted frame, and no motion."""
+    last = last_pose(state)
+    if state.motion is None:
+        return [last, last]
+    ratio = (timestamp - _last_trusted(state).timestamp) / max(state.motion.seconds, DT_MIN)
+    return [last @ _scaled(state.motion.T_older_newer, min(max(ratio, 0.0), DT_RATIO_MAX)), last]
+
+
 def _last_trusted(state: SlamState) -> Record:
     return next(r for r in reversed(state.records) if r.status in (Status.OK, Status.WEAK))
 
 
-def _least(before: float, residual: float) -> float:
-    """What trusted frames end at of late, at least: falls at once, and rises by a little each time."""
-    over = max(residual - before, 0.0)
-    return min(residual, before + RESIDUAL_RISE * over) if before else residual
+def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState:
+    """With motion and residual after a trusted frame."""
+    newest, older = state.records[-1], _last_trusted(before)
+    T_older_newer = inverse(pose_of(state, before.records[-1])) @ pose_of(state, newest)
+    motion = Motion(T_older_newer, newest.timestamp - older.timestamp)
+    over = max(residual - before.residual, 0.0)
+    floor = min(residual, before.residual + RESIDUAL_RISE * over) if before.residual else residual
+    return state._replace(motion=motion, residual=floor)
+
+
+def _scaled(motion: Pose, ratio: float) -> Pose:
+    scaled = np.eye(4)
+    scaled[:3, :3] = Rotation.from_rotvec(
+        ratio * Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    ).as_matrix()
+    scaled[:3, 3] = ratio * motion[:3, 3]
+    return scaled
 
 
 def _stats(state: SlamState, depth: np.ndarray, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:

@@ -83,14 +83,11 @@ class Refinement(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Of the camera at the last trusted frame, as twists (v, omega) in its own frame."""
+    """Between the last two trusted frames."""
 
-    velocity: Float64[np.ndarray, "6"]
-    """Metres and radians a second."""
-    covariance: Float64[np.ndarray, "12 12"]
-    """Of the pose, metres and radians, then of the velocity."""
+    T_older_newer: Pose
+    """Camera to camera."""
     seconds: float
-    """Since the trusted frame before."""
 
 
 class FrameInfo(NamedTuple):

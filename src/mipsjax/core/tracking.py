@@ -25,7 +25,7 @@ SATURATED = 0.95  # of the truncation: beyond it the field is flat and says noth
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
-RIDGE = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
+PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
 class Points(NamedTuple):
@@ -35,14 +35,6 @@ class Points(NamedTuple):
     color: Float[Array, "P 3"]
     mask: Bool[Array, " P"]
     """False where there is no measurement."""
-
-
-class Prior(NamedTuple):
-    """Where the motion up to now puts the camera, and how certainly."""
-
-    T_sub_cam: Float[Array, "4 4"]
-    precision: Float[Array, "6 6"]
-    """Inverse covariance of the twist from there, metres and radians; zeros where nothing is known."""
 
 
 class Fit(NamedTuple):
@@ -66,8 +58,6 @@ class TrackInfo(NamedTuple):
     """RO was run."""
     ok: Bool[Array, ""]
     """Everything is finite; if not, the pose is the candidate."""
-    information: Float[Array, "6 6"]
-    """What the frame says of its pose: inverse covariance of a twist from there, metres and radians."""
 
 
 def draw_points(
@@ -125,25 +115,35 @@ def levenberg_marquardt(
     cfg: Config,
     views: Views | None = None,
     view_camera: Intrinsics | None = None,
-    prior: Prior | None = None,
 ) -> Float[Array, "4 4"]:
     """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
 
     Points weigh by the noise of their depth: what is near says more, also of the rotation.
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
-    the map is never an improvement. Depth images of keyframes are a second term where `views` are given, and where the
-    motion puts the camera is a third.
+    the map is never an improvement. Depth images of keyframes are a second term where `views` are given.
     """
+    go, precision = cfg.track.go, precisions(points, cfg)
+
+    def from_view(T, errors):
+        rows, narrow = _jacobian(T, points, errors.normal), go.view_robust
+        weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / narrow) ** 2)
+        # A point that falls on nothing costs as much as one that is as far off as is allowed
+        off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
+        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * precision)
 
     def system(T):
-        total = frame_system(field, T, points, part, cfg, views, view_camera)
-        return total if prior is None else jax.tree.map(jnp.add, total, prior_system(prior, T, points, cfg))
+        total = map_system(field, T, points, part, cfg)
+        if views is None or view_camera is None:
+            return total
+        errors = plane_errors(views, transform(T, points.p_cam), view_camera, VIEW_REACH)
+        each = jax.vmap(from_view, (None, 0))(T, errors)
+        return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, each)
 
     def step(carry, _):
         here, damping = carry
         T, now = here
-        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + RIDGE * jnp.eye(6)
+        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + PRIOR * jnp.eye(6)
         twist = -jnp.linalg.solve(damped, now.slope)
         T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
         there = T_new, system(T_new)
@@ -154,32 +154,6 @@ def levenberg_marquardt(
     start = ((T, system(T)), jnp.float32(DAMPING))
     ((T, _), _), _ = jax.lax.scan(step, start, None, length=steps)
     return T
-
-
-def frame_system(
-    field: nf.Field,
-    T: Float[Array, "4 4"],
-    points: Points,
-    part: nf.Part,
-    cfg: Config,
-    views: Views | None = None,
-    view_camera: Intrinsics | None = None,
-) -> System:
-    """Normal equations of all that a frame measures, the map and the depth images of keyframes."""
-    go, precision = cfg.track.go, precisions(points, cfg)
-    total = map_system(field, T, points, part, cfg)
-    if views is None or view_camera is None:
-        return total
-
-    def from_view(errors):
-        rows, narrow = _jacobian(T, points, errors.normal), go.view_robust
-        weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / narrow) ** 2)
-        # A point that falls on nothing costs as much as one that is as far off as is allowed
-        off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
-        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * precision)
-
-    each = jax.vmap(from_view)(plane_errors(views, transform(T, points.p_cam), view_camera, VIEW_REACH))
-    return jax.tree.map(lambda a, b: a + jnp.sum(b, 0), total, each)
 
 
 def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> System:
@@ -197,21 +171,6 @@ def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf
     if go.uncertainty:
         weight *= losses.certainty(entropy, go.entropy_floor)
     return _system(psi, rows, weight, robust_cost(psi, scale) * precision)
-
-
-def prior_system(prior: Prior, T: Float[Array, "4 4"], points: Points, cfg: Config) -> System:
-    """The same of the twist from where the motion puts the camera, to first order."""
-    apart = jaxlie.SE3.from_matrix(prior.T_sub_cam).inverse() @ jaxlie.SE3.from_matrix(T)
-    twist, weight = apart.log(), prior.precision / _independent(points, cfg)
-    return System(twist @ weight @ twist, weight, weight @ twist)
-
-
-def _independent(points: Points, cfg: Config) -> float:
-    """Factor from the units of the normal equations to inverse variances.
-
-    There a point weighs 1 with the noise close by, and all count, although their errors are much alike.
-    """
-    return cfg.track.go.effective_points / (len(points.mask) * cfg.sensor.noise_floor**2)
 
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
@@ -282,12 +241,11 @@ def track(
     cfg: Config,
     views: Views | None = None,
     converged: Float[Array, ""] | None = None,
-    prior: Prior | None = None,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
 
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
-    field also align the frame to. These steps also stay near the `prior`, if one is given.
+    field also align the frame to.
 
     With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best
     candidate, and RO then GO follow where that ends above the residual `converged` (metres, `track.ro.residual` if
@@ -307,8 +265,8 @@ def track(
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
             if cfg.field.encoding == "both":
-                T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg, prior=prior)
-            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg, views, view_camera, prior)
+                T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg)
+            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg, views, view_camera)
         return T, measure_fit(field, T, points, "whole", cfg)
 
     def searched(T):
@@ -330,8 +288,7 @@ def track(
         if ro.when == "needed":
             T, after = jax.lax.cond(used_ro, again, lambda: (T, after))
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
-    hessian = frame_system(field, T, points, "whole", cfg, views, view_camera).hessian
-    return jnp.where(ok, T, start), TrackInfo(before, after, used_ro, ok, _independent(points, cfg) * hessian)
+    return jnp.where(ok, T, start), TrackInfo(before, after, used_ro, ok)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
