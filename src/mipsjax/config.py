@@ -206,8 +206,8 @@ class RefineConfig:
     pixels: int = 2304
     steps: int = 10
     smooth_pixels: int = 768
-    """The same for the choice among the candidates of the motion prior, and for the first steps where there is a
-    smooth field besides the fine one."""
+    """For the choice among the candidates of the motion prior, and for steps on the smooth field where there is one
+    besides the fine one: before the others, where those alone have not converged."""
     smooth_steps: int = 7
     final_steps: int = 4
     """Of a last alignment of every frame to the finished map, with `lm`; 0 is none, as in the paper."""

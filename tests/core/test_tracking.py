@@ -149,6 +149,16 @@ def test_track_converges_from_near_without_a_search(corner_map, frame):
     assert info.after.residual < info.before.residual and info.after.known > 0.9
 
 
+def test_the_smooth_field_has_no_part_where_the_fine_one_is_enough(corner_map, frame):
+    """It is less exact: what a frame hardly holds it would move."""
+    start = TRUTH @ NEAR
+    assert corner_map.field.smooth is not None
+    blank = corner_map.field._replace(smooth=jax.tree.map(jnp.zeros_like, corner_map.field.smooth))
+    (T, info), (with_blank, _) = (track(field, frame, start, start) for field in (corner_map.field, blank))
+    assert not info.searched
+    np.testing.assert_array_equal(T, with_blank)
+
+
 def test_track_starts_from_the_better_candidate(corner_map, frame):
     good, bad = TRUTH @ NEAR, TRUTH @ pose((0, 40, 0), (0.5, 0, 0))
     one, _ = track(corner_map.field, frame, good, bad)

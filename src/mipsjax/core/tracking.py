@@ -247,9 +247,10 @@ def track(
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to.
 
-    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best
-    candidate, and RO then GO follow where that ends above the residual `converged` (metres, `track.ro.residual` if
-    not given); the better end is kept. `widening` is a factor on the swarm's first radii.
+    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best candidate.
+    Where that ends above the residual `converged` (metres, `track.ro.residual` if not given), GO by way of the smooth
+    field follows, and where that does too, RO then GO; the better end is kept. `widening` is a factor on the swarm's
+    first radii.
     """
     k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
     ro, go = cfg.track.ro, cfg.track.go
@@ -260,33 +261,46 @@ def track(
     before = measure_fit(field, start, points, "whole", cfg)
     view_camera = None if views is None else camera.decimated(round(camera.width / views.depth.shape[2]))
 
-    def refined(T):
+    limit = ro.residual if converged is None else converged
+    smooth = go.method == "lm" and cfg.field.encoding == "both"
+
+    def near(T):
         if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
-            if cfg.field.encoding == "both":
-                T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg)
             T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg, views, view_camera)
         return T, measure_fit(field, T, points, "whole", cfg)
 
-    def searched(T):
-        return refined(search(field, depth, color, T, widening, k_ro, camera, cfg))
+    def far(T):
+        if smooth:
+            T = levenberg_marquardt(field, T, coarse, "search", go.smooth_steps, cfg)
+        return near(T)
 
-    if ro.when == "always":
-        (T, after), used_ro = searched(start), jnp.bool_(True)
-    else:
-        T, after = refined(start)
-        limit = ro.residual if converged is None else converged
-        used_ro = (after.residual > limit) | (after.known < ro.inliers) | ~jnp.isfinite(after.residual)
-        used_ro = used_ro & (ro.when == "needed")
+    def searched(T):
+        return far(search(field, depth, color, T, widening, k_ro, camera, cfg))
+
+    def tried(attempt, found):
+        """The better of what was found and of another attempt, where the first has not converged; and whether."""
+        fit = found[1]
+        failed = (fit.residual > limit) | (fit.known < ro.inliers) | ~jnp.isfinite(fit.residual)
 
         def again():
-            there = searched(start)
-            better = (there[1].residual < after.residual) | ~jnp.isfinite(after.residual)
-            return jax.tree.map(partial(jnp.where, better), there, (T, after))
+            there = attempt(start)
+            better = (there[1].residual < fit.residual) | ~jnp.isfinite(fit.residual)
+            return jax.tree.map(partial(jnp.where, better), there, found)
 
+        return jax.lax.cond(failed, again, lambda: found), failed
+
+    used_ro = jnp.bool_(ro.when == "always")
+    if ro.when == "always":
+        T, after = searched(start)
+    else:
+        found = near(start)
+        if smooth:
+            found, _ = tried(far, found)
         if ro.when == "needed":
-            T, after = jax.lax.cond(used_ro, again, lambda: (T, after))
+            found, used_ro = tried(searched, found)
+        T, after = found
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     return jnp.where(ok, T, start), TrackInfo(before, after, used_ro, ok)
 
