@@ -186,6 +186,38 @@ def test_older_loops_are_judged_again(chain):
     assert 50 not in {k.number for k in after.submaps[1].keyframes}
 
 
+def test_after_the_last_frame_the_graph_is_solved_by_all_that_submaps_share(ring):
+    """Also without a frame that disagrees: here the first that closed the ring was found 30 cm off."""
+    given, truth = ring
+    first = given.with_submap(0, keyframes=given.submaps[0].keyframes[:-1])
+    off_by = pose(translation=(0.3, 0.0, 0.0))
+    wrong = closing(first, 0, COUNT - 1, 99, truth[-1] @ off_by, np.eye(4))
+    keyframes = (*wrong.submaps[0].keyframes, given.submaps[0].keyframes[-1])
+    late = closing(wrong.with_submap(0, keyframes=keyframes), 0, COUNT - 1, 101, truth[-1], np.eye(4))
+    loop = Loop(99, COUNT - 1, 0, "box", 0.9, 0.0, 0.0, weight=1.0)
+    after = closure.closed_again(late._replace(loops=(loop,)), CFG)
+    assert off(after, truth) < 0.1 * off(given, truth)
+    assert after.loops == (loop,)
+
+
+def test_after_the_last_frame_a_false_loop_is_rejected_too(ring):
+    given, truth = ring
+    wrong = closing(given, 1, 4, 50, ELSEWHERE, np.eye(4))
+    kept = Loop(50, 4, 1, "box", 0.9, 0.0, 0.0, weight=1.0)
+    after = closure.closed_again(arrived(wrong)._replace(loops=(kept,)), CFG)
+    assert [loop.weight for loop in after.loops] == [0]
+    assert 50 not in {k.number for k in after.submaps[1].keyframes}
+    assert off(after, truth) < 0.1 * off(given, truth)
+
+
+@pytest.mark.parametrize("why", ["a chain", "no loops wanted"])
+def test_after_the_last_frame_nothing_moves(chain, ring, why):
+    """Where each submap is held by the one that it was begun from alone, or no loop is to be closed."""
+    given = (chain if why == "a chain" else ring)[0]
+    cfg = CFG if why == "a chain" else replace(CFG, loop=replace(CFG.loop, enabled=False))
+    assert closure.closed_again(given, cfg) is given
+
+
 def arrived(given: SlamState) -> SlamState:
     """With frame 100 as the newest keyframe of the last submap; of every second frame of a sequence at 20 Hz."""
     keyframes = (*given.submap.keyframes, keyframe(100, T_LAST_CAM))

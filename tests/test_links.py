@@ -8,8 +8,9 @@ import pytest
 from maps import keyframe, pose, state, submap
 from mipsjax import links
 from mipsjax.config import Config
-from mipsjax.state import world_pose
+from mipsjax.state import Submap, inverse, world_pose
 
+CFG = Config()
 INF = float("inf")
 
 
@@ -24,14 +25,46 @@ def test_a_shared_frame_measures_one_submap_in_the_other():
     np.testing.assert_allclose(back.T_first_second, np.linalg.inv(T_first_second), atol=1e-12)
 
 
-def test_the_best_link_is_nearest_to_both_anchors():
+def test_along_the_chain_the_best_link_is_nearest_to_both_anchors():
     near, far = pose(translation=(0.5, 0.0, 0.0)), pose(translation=(0.0, 0.0, 4.0))
     first = submap(keyframe(0), keyframe(1, far), keyframe(2, near), keyframe(3, near))
     second = submap(keyframe(1, near), keyframe(2, far), keyframe(3, near))
-    best = links.best_link(first, second)
+    best = links.best_link(first, second, True, CFG)
     assert best is not None and best.first.number == 3
     assert best.reach == pytest.approx(np.hypot(0.5, 0.5))
-    assert links.best_link(first, submap(keyframe(8))) is None
+    assert links.best_link(first, submap(keyframe(8)), True, CFG) is None
+    assert links.best_link(first, submap(keyframe(8)), False, CFG) is None
+
+
+def meeting(*off: np.ndarray) -> tuple[Submap, Submap]:
+    """Frames of a straight way that two submaps share, each registered this far off in the first."""
+    T_first_second, count = pose((5.0, -20.0, 3.0), (1.0, 0.2, -0.5)), len(off)
+    second = [keyframe(n, pose(translation=(0.2 * n, 0.0, 0.0))) for n in range(count)]
+    first = [
+        k._replace(T_sub_cam=T_first_second @ k.T_sub_cam @ by) for k, by in zip(second, off, strict=True)
+    ]
+    return submap(*first), submap(*second)
+
+
+def test_elsewhere_the_best_link_is_the_one_that_the_others_agree_with():
+    """The first of a loop was found 8 cm and a degree off; the one nearest to both anchors is that one."""
+    bad, slight = pose((0.0, 1.0, 0.0), (0.08, 0.0, 0.0)), pose(translation=(0.004, 0.0, 0.0))
+    pair = meeting(bad, slight, np.eye(4), inverse(slight))
+    best = links.best_link(*pair, False, CFG)
+    assert best is not None and best.first.number == 2
+    bad_first, *agreeing = links.disagreement(links.links(*pair), CFG)
+    assert bad_first > 5 and max(agreeing) < 1
+    alone = links.best_link(*meeting(bad, np.eye(4)), False, CFG)
+    assert alone is not None and alone.first.number == 1, "of two the newer"
+
+
+def test_disagreement_is_in_standard_deviations_at_the_frames():
+    """A link that is turned puts frames wrong by the more the farther they are from its own."""
+    turned = pose((0.0, np.degrees(CFG.loop.sigma_rotation), 0.0))
+    off = links.disagreement(links.links(*meeting(turned, np.eye(4), np.eye(4))), CFG)
+    shift = 2 * 0.2 * np.sin(CFG.loop.sigma_rotation / 2) / CFG.loop.sigma
+    assert off[0] == pytest.approx(np.hypot(1, shift), rel=1e-3)
+    assert off[1] == off[2] == pytest.approx(0, abs=1e-6)
 
 
 def test_pairs_that_share_a_frame():

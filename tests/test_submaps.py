@@ -197,7 +197,7 @@ def test_nothing_compiles_after_the_first_frames(frames, sequence):
 
 def apart(state: SlamState) -> Pair:
     """The two submaps as if the second had not been begun from the first, so that meeting again is a loop."""
-    return pair_of([submap._replace(parent=None) for submap in state.submaps], (0, 1))
+    return pair_of([submap._replace(parent=None) for submap in state.submaps], (0, 1), CFG)
 
 
 def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
@@ -232,7 +232,7 @@ def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
 
 def test_surfaces_say_nothing_along_the_chain(states):
     state = states[-1]
-    assert plane_factor(pair_of(state.submaps, (0, 1)), True, state.camera, CFG) is None
+    assert plane_factor(pair_of(state.submaps, (0, 1), CFG), True, state.camera, CFG) is None
 
 
 def to_scene(sequence, p_first: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from mipsjax.core import tracking
 from mipsjax.core.tracking import Registration
 from mipsjax.presets import PRESETS
 from mipsjax.state import SlamState, inverse
-from mipsjax.territory import Expected, expect, settle
+from mipsjax.territory import Expected, expect, settle, sight
 
 CFG = PRESETS["tiny"]
 LOOP = CFG.loop
@@ -39,6 +39,7 @@ def test_the_nearest_shared_frame_says_where_one_lies_in_a_neighbour(neighbours)
         newest = neighbours.submap.keyframes[-1].T_sub_cam
         np.testing.assert_allclose(said.T_sub_cam, T_OLD_NEW @ BENT @ newest, atol=1e-12)
         assert said.metres == pytest.approx(LOOP.sigma + 0.1 * LOOP.drift)
+        assert said.radians == pytest.approx(LOOP.sigma_rotation + 0.1 * LOOP.drift_rotation)
 
 
 @pytest.mark.parametrize("why", ["across a loop", "nothing shared"])
@@ -55,19 +56,24 @@ def test_elsewhere_the_poses_of_the_submaps_say_it_and_may_be_off_by_anything(ne
     assert said.agrees(maps.pose((90.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
 
 
-def lands(monkeypatch, off: np.ndarray, held: float = 1.0) -> None:
-    """Every frame fits, this far from where it is expected."""
+def lands(monkeypatch, *ends: np.ndarray, held: float = 1.0) -> list[np.ndarray]:
+    """Every frame fits. In turn registration ends here, then always at the last of these; returns where it began."""
+    began = []
 
     def register(field, depth, T, camera, cfg):
-        return Registration(T @ off, np.ones(()), np.ones(()), np.float32(held))
+        began.append(np.asarray(T))
+        return Registration(ends[min(len(began), len(ends)) - 1], np.ones(()), np.ones(()), np.float32(held))
 
     monkeypatch.setattr(tracking, "register", register)
+    return began
 
 
 @pytest.mark.parametrize(("share", "linked"), [(0.9, True), (1.1, False)])
-def test_a_frame_found_elsewhere_in_a_neighbour_is_not_linked(neighbours, monkeypatch, share, linked):
-    farthest = expect(neighbours, 0, CFG).metres
-    lands(monkeypatch, maps.pose(translation=(share * farthest, 0.0, 0.0)))
+@pytest.mark.parametrize("how", ["shifted", "turned"])
+def test_a_frame_found_elsewhere_in_a_neighbour_is_not_linked(neighbours, monkeypatch, how, share, linked):
+    said = expect(neighbours, 0, CFG)
+    turn, shift = (share * said.radians, 0.0) if how == "turned" else (0.0, share * said.metres)
+    lands(monkeypatch, said.T_sub_cam @ maps.pose((0.0, np.degrees(turn), 0.0), (shift, 0.0, 0.0)))
     after, sightings = settle(neighbours, CFG)
     assert [sighting.submap for sighting in sightings] == [0] * linked
     assert [k.number for k in after.submaps[0].keyframes] == [0, 3, 7, 8] + [9] * linked
@@ -82,5 +88,21 @@ def test_both_parts_of_a_pose_must_agree_with_what_is_expected():
 
 @pytest.mark.parametrize(("held", "linked"), [(2.0, True), (0.5, False)])
 def test_surfaces_must_hold_a_frame_in_every_direction(neighbours, monkeypatch, held, linked):
-    lands(monkeypatch, np.eye(4), held * LOOP.held)
+    lands(monkeypatch, expect(neighbours, 0, CFG).T_sub_cam, held=held * LOOP.held)
     assert bool(settle(neighbours, CFG)[1]) is linked
+
+
+@pytest.mark.parametrize(
+    ("moves", "calls"), [((0.002,), 1), ((0.1, 0.104), 2), ((0.1, 0.2, 0.3, 0.4, 0.5), 4)]
+)
+def test_a_frame_is_registered_again_while_that_moves_it(neighbours, monkeypatch, moves, calls):
+    """Across a loop the guess may be decimetres off; the rounds have an end."""
+    guess = maps.pose((0.0, 30.0, 0.0), (1.0, 0.0, 0.0))
+    ends = [guess @ maps.pose(translation=(x, 0.0, 0.0)) for x in moves]
+    began = lands(monkeypatch, *ends)
+    found = sight(neighbours, 0, neighbours.submap.keyframes[-1], Expected(guess), CFG)
+    assert len(began) == calls
+    for start, where in zip(began, [guess, *ends], strict=False):
+        np.testing.assert_allclose(start, where, atol=1e-6)
+    assert found is not None
+    np.testing.assert_allclose(found.T_sub_cam, ends[calls - 1], atol=1e-6)

@@ -97,11 +97,26 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
         )
         for sighting, how in loops
     )
-    known = tuple(
+    judged = _judged(solved, weights)
+    return judged._replace(loops=(*judged.loops, *made))
+
+
+def closed_again(state: SlamState, cfg: Config) -> SlamState:
+    """After the last frame: the pose graph by all frames that submaps share and by finished surfaces, if any of its
+    edges says more than that one submap was begun from another."""
+    begun = {(submap.parent, place) for place, submap in enumerate(state.submaps)}
+    if not cfg.loop.enabled or begun.issuperset(linked_pairs(state)):
+        return state
+    return _judged(*solve(state, cfg, frozenset(loop.frame for loop in state.loops)))
+
+
+def _judged(state: SlamState, weights: dict[tuple[int, int], float]) -> SlamState:
+    """With what the pose graph made of the loops that were known before."""
+    loops = tuple(
         loop._replace(weight=loop.weight and weights.get(_pair(loop.first, loop.second), loop.weight))
         for loop in state.loops
     )
-    return without_rejected(solved, weights)._replace(loops=(*known, *made))
+    return without_rejected(state, weights)._replace(loops=loops)
 
 
 def solve(
@@ -121,7 +136,7 @@ def solve(
     )  # gtsam takes a second to load, and may not be needed
 
     places = linked_pairs(state)
-    pairs = [pair_of(state.submaps, place) for place in places]
+    pairs = [pair_of(state.submaps, place, cfg) for place in places]
     near = {p: [n < cfg.loop.apart for n in chain_distances(state, p)] for p, _ in places}
     sure = [
         near[j][k] and (pair.chained or pair.link.first.number not in doubtful)

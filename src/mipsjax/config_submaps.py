@@ -77,7 +77,7 @@ class LoopConfig:
     to one that is to be linked to a neighbour: ten times what is usual, since a true loop that comes after more drift
     than this would allow is rejected."""
     drift_rotation: float = 0.015
-    """Radians of drift for each metre from the anchor."""
+    """Radians, the same."""
     sigma: float = 0.02
     """Metres, of a frame that was registered in a submap, and of one at its anchor. This and the drift are how far a
     frame to be linked to a neighbour may be from where it is expected."""

@@ -1,4 +1,4 @@
-"""After the last frame: bundle adjustment over all keyframes, then every frame aligned to the finished map."""
+"""After the last frame: bundle adjustment over all keyframes, the pose graph once more, and every frame aligned."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from mipsjax.background import taken_over
 from mipsjax.bundle import FINISH, MAP, adjust, random_key
+from mipsjax.closure import closed_again
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.links import unjoined
@@ -23,12 +24,13 @@ ALIGNED = 16  # frames in one call of `tracking.align`
 
 
 def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
-    """The state after the last frame: `map.final_steps` steps of mapping of each submap, then `track.go.final_steps`
-    of tracking of each frame. `executor` is the one that `step` was given. Warns where submaps hang on
-    nothing."""
+    """The state after the last frame: `map.final_steps` steps of mapping of each submap, the pose graph by what they
+    know then, and `track.go.final_steps` of tracking of each frame. `executor` is the one that `step` was given. Warns
+    where submaps hang on nothing."""
     state = taken_over(state, executor)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
+    state = closed_again(state, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":
         for place in range(len(state.submaps)):
             state = _aligned(state, place, cfg)

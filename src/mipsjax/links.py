@@ -6,6 +6,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from mipsjax.config import Config
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse
@@ -34,9 +35,26 @@ def links(first: Submap, second: Submap) -> list[Link]:
     return [Link(k, others[k.number]) for k in first.keyframes if k.number in others]
 
 
-def best_link(first: Submap, second: Submap) -> Link | None:
-    """The one nearest to both anchors."""
-    return min(links(first, second), key=lambda link: link.reach, default=None)
+def best_link(first: Submap, second: Submap, chained: bool, cfg: Config) -> Link | None:
+    """Of two submaps of which one was begun from the other (`chained`), the one nearest to both anchors. Of others,
+    where each frame was registered on its own, the one that the others agree with best; the newer of two."""
+    found = links(first, second)
+    if not found or chained:
+        return min(found, key=lambda link: link.reach, default=None)
+    return found[::-1][int(np.argmin(disagreement(found, cfg)[::-1]))]
+
+
+def disagreement(found: list[Link], cfg: Config) -> Float64[np.ndarray, " N"]:
+    """Of each link, how far off it puts the frames of the others: the median, in standard deviations."""
+    firsts, seconds = (np.stack([k.T_sub_cam for k in side]) for side in zip(*found, strict=True))
+    loop = cfg.loop
+    medians = []
+    for link in found:
+        off = np.linalg.inv(firsts) @ link.T_first_second @ seconds
+        cosine = (np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+        turn, shift = np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(off[:, :3, 3], axis=1)
+        medians.append(np.median(np.hypot(turn / loop.sigma_rotation, shift / loop.sigma)))
+    return np.array(medians)
 
 
 def linked_pairs(state: SlamState) -> list[tuple[int, int]]:

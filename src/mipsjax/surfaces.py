@@ -31,18 +31,17 @@ class Pair(NamedTuple):
     link: Link
     places: tuple[int, int]
 
-    @property
-    def chained(self) -> bool:
-        """One was begun from the other."""
-        return self.second.parent == self.places[0] or self.first.parent == self.places[1]
+    chained: bool
+    """One was begun from the other."""
 
 
-def pair_of(submaps: Sequence[Submap], places: tuple[int, int]) -> Pair:
+def pair_of(submaps: Sequence[Submap], places: tuple[int, int], cfg: Config) -> Pair:
     """Of two submaps that share a frame."""
     first, second = (submaps[place] for place in places)
-    link = best_link(first, second)
+    chained = second.parent == places[0] or first.parent == places[1]
+    link = best_link(first, second, chained, cfg)
     assert link is not None
-    return Pair(first, second, link, places)
+    return Pair(first, second, link, places, chained)
 
 
 def pose_factor(pair: Pair, trusted: bool, cfg: Config) -> RelativePose:
@@ -84,7 +83,7 @@ def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> 
 def prepare(submap: Submap, camera: Intrinsics, cfg: Config) -> None:
     """Compiles what two submaps will need, on one submap and itself."""
     anchor = submap.keyframes[0]
-    itself = Pair(submap, submap, Link(anchor, anchor), (0, 0))
+    itself = Pair(submap, submap, Link(anchor, anchor), (0, 0), False)
     _matched(itself, _surface(itself, camera, cfg), np.eye(4), cfg)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from mipsjax.links import chain_distances, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
+
+AGAIN = 3  # times at most that a frame is registered once more; the second moves it by millimetres
 
 
 class Sighting(NamedTuple):
@@ -87,8 +89,8 @@ def expect(state: SlamState, place: int, cfg: Config) -> Expected:
     """Where the newest keyframe of the active submap lies in the submap at `place`.
 
     Near along the chain the nearest frame that both share says so, up to what tracking may have drifted since: one
-    found elsewhere has slid along surfaces that hardly hold it. Across a loop, or where none is shared, the poses of
-    the submaps say so, which may be off by any amount.
+    found elsewhere has slid along surfaces that hardly hold it, or turned towards what the submap has never seen.
+    Across a loop, or where none is shared, the poses of the submaps say so, which may be off by any amount.
     """
     keyframe, other, loop = state.submap.keyframes[-1], state.submaps[place], cfg.loop
     shared = links(other, state.submap)
@@ -96,8 +98,11 @@ def expect(state: SlamState, place: int, cfg: Config) -> Expected:
         return Expected(inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
     away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
     nearest = min(range(len(shared)), key=away.__getitem__)
-    T_sub_cam = shared[nearest].T_first_second @ keyframe.T_sub_cam
-    return Expected(T_sub_cam, loop.sigma + loop.drift * away[nearest])
+    return Expected(
+        shared[nearest].T_first_second @ keyframe.T_sub_cam,
+        loop.sigma + loop.drift * away[nearest],
+        loop.sigma_rotation + loop.drift_rotation * away[nearest],
+    )
 
 
 def sight(
@@ -107,17 +112,8 @@ def sight(
 
     Unless that was `measured`, as by image features, the surfaces must hold the frame in every direction.
     """
-    small = mapping_camera(state.camera, cfg)
-    found = jax.device_get(
-        tracking.register(
-            state.submaps[place].learned.field,
-            jnp.asarray(keyframe.depth),
-            jnp.asarray(expected.T_sub_cam, jnp.float32),
-            small,
-            cfg,
-        )
-    )
     loop = cfg.loop
+    found = _registered(state.submaps[place], keyframe, expected.T_sub_cam, state.camera, cfg)
     fits = found.overlap >= loop.overlap and found.inliers >= loop.inliers
     if not measured:
         fits = fits and found.held >= loop.held
@@ -125,6 +121,22 @@ def sight(
         return None
     T_sub_cam = rigid(found.T_sub_cam)
     return Sighting(place, T_sub_cam, float(found.inliers)) if expected.agrees(T_sub_cam) else None
+
+
+def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrinsics, cfg: Config) -> Any:
+    """On the host. Again from where it ended while that moves it: across a loop the guess may be decimetres off."""
+    small, depth = mapping_camera(camera, cfg), jnp.asarray(keyframe.depth)
+
+    def register(T_sub_cam: Pose) -> Any:
+        start = jnp.asarray(T_sub_cam, jnp.float32)
+        return jax.device_get(tracking.register(submap.learned.field, depth, start, small, cfg))
+
+    found = register(guess)
+    for _ in range(AGAIN):
+        if max(distance(guess, found.T_sub_cam)) < cfg.loop.tolerance:
+            break
+        guess, found = found.T_sub_cam, register(found.T_sub_cam)
+    return found
 
 
 def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:
