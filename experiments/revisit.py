@@ -58,8 +58,8 @@ def glued() -> Iterator[None]:
     """With a loop the camera goes over to the submap that it has met, and all submaps stay where they are."""
     original, governed = closure.solve, slam.govern
 
-    def solve(state, cfg, doubtful=frozenset()):
-        return state, original(state, cfg, doubtful)[1]
+    def solve(state, cfg):
+        return state, original(state, cfg)[1]
 
     def govern(state, cfg):
         loop = state.loops[-1] if state.loops else None

@@ -189,22 +189,27 @@ def test_older_loops_are_judged_again(chain):
 def test_after_the_last_frame_the_graph_is_solved_by_all_that_submaps_share(ring):
     """Also without a frame that disagrees: here the first that closed the ring was found 30 cm off."""
     given, truth = ring
-    first = given.with_submap(0, keyframes=given.submaps[0].keyframes[:-1])
-    off_by = pose(translation=(0.3, 0.0, 0.0))
-    wrong = closing(first, 0, COUNT - 1, 99, truth[-1] @ off_by, np.eye(4))
-    keyframes = (*wrong.submaps[0].keyframes, given.submaps[0].keyframes[-1])
-    late = closing(wrong.with_submap(0, keyframes=keyframes), 0, COUNT - 1, 101, truth[-1], np.eye(4))
+    wrong = closing(given, 0, COUNT - 1, 99, truth[-1] @ pose(translation=(0.3, 0.0, 0.0)), np.eye(4))
+    late = closing(wrong, 0, COUNT - 1, 101, truth[-1], np.eye(4))
     loop = Loop(99, COUNT - 1, 0, "box", 0.9, 0.0, 0.0, weight=1.0)
     after = closure.closed_again(late._replace(loops=(loop,)), CFG)
     assert off(after, truth) < 0.1 * off(given, truth)
     assert after.loops == (loop,)
 
 
+def test_where_nothing_was_judged_after_the_last_frame_all_stays(ring, monkeypatch):
+    given, _ = ring
+    loop = Loop(100, COUNT - 1, 0, "box", 0.9, 0.0, 0.0, weight=1.0)
+    monkeypatch.setattr(closure, "solve", lambda state, cfg: (state, {}))
+    assert closure.closed_again(given._replace(loops=(loop,)), CFG) == given._replace(loops=(loop,))
+
+
 def test_after_the_last_frame_a_false_loop_is_rejected_too(ring):
     given, truth = ring
     wrong = closing(given, 1, 4, 50, ELSEWHERE, np.eye(4))
     kept = Loop(50, 4, 1, "box", 0.9, 0.0, 0.0, weight=1.0)
-    after = closure.closed_again(arrived(wrong)._replace(loops=(kept,)), CFG)
+    tracked = [given.records[0]._replace(submap=4) for _ in range(51)]
+    after = closure.closed_again(wrong._replace(records=tuple(tracked), loops=(kept,)), CFG)
     assert [loop.weight for loop in after.loops] == [0]
     assert 50 not in {k.number for k in after.submaps[1].keyframes}
     assert off(after, truth) < 0.1 * off(given, truth)
@@ -235,17 +240,27 @@ def test_neighbours_along_the_chain_are_never_rejected(ring):
     assert weights[1, 3] == 1
 
 
-def test_a_false_loop_is_no_neighbour_of_a_neighbour(ring):
-    """Its frame is in the next submap too, which is near the one that it was wrongly found in."""
+@pytest.mark.parametrize("later", [200, 201])
+def test_a_false_loop_is_no_neighbour_of_a_neighbour(ring, later):
+    """Its frames are in the next submap too, which is near the one that they were wrongly found in, whichever frame
+    holds that pair."""
     given, truth = ring
-    wrong = closing(given, 1, 4, 200, ELSEWHERE, np.eye(4))
-    also = (*wrong.submaps[3].keyframes, keyframe(200, STEP @ DRIFT))
-    wrong = wrong.with_submap(3, keyframes=also)
-    solved, weights = solve(wrong, CFG, frozenset({200}))
+    wrong = given
+    for number in {200, later}:
+        wrong = closing(wrong, 1, 4, number, ELSEWHERE, np.eye(4))
+        also = (*wrong.submaps[3].keyframes, keyframe(number, STEP @ DRIFT))
+        wrong = wrong.with_submap(3, keyframes=also)
+    solved, weights = solve(wrong, CFG)
     assert weights[1, 4] == 0 and weights[1, 3] == 0 and weights[0, COUNT - 1] == 1
     assert off(solved, truth) < 0.1 * off(given, truth)
-    trusted, _ = solve(wrong, CFG)
-    assert off(trusted, truth) > off(given, truth), "this is what would come of it"
+
+
+def test_what_would_come_of_a_false_neighbour(ring):
+    """Had it no frame in common with the loop: tracking would vouch for it."""
+    given, truth = ring
+    wrong = closing(closing(given, 1, 4, 200, ELSEWHERE, np.eye(4)), 1, 3, 201, ELSEWHERE, STEP @ DRIFT)
+    trusted, weights = solve(wrong, CFG)
+    assert weights[1, 3] == 1 and off(trusted, truth) > off(given, truth)
 
 
 def test_a_submap_that_hangs_on_nothing_stays(ring):

@@ -12,7 +12,7 @@ import pytest
 
 import maps
 from compilations import compilations
-from mipsjax import closure, recovery, schedule, slam, territory
+from mipsjax import closure, final, recovery, schedule, slam, territory
 from mipsjax.bundle import make_keyframe
 from mipsjax.config import Config, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
@@ -37,9 +37,11 @@ CFG = replace(
     # Views cut short and boxes so small that two metres of motion need a second one
     volume=VolumeConfig(max_side=2.0, far=1.2, overlap=0.8, hysteresis=0.05, support=2),
     # Of a map that has learned little; and lost frames are given up soon
-    loop=LoopConfig(overlap=0.3, inliers=0.6, fewest_points=50, patience=2),
+    loop=LoopConfig(overlap=0.3, inliers=0.6, sigma_rotation=0.04, fewest_points=40, patience=2),
     map=replace(PRESETS["tiny"].map, steps=10, steps_slow=10),
 )
+STIFF = replace(CFG, loop=replace(CFG.loop, sigma_rotation=LoopConfig().sigma_rotation))
+"""Shared frames hold two submaps as firmly as those of a good map."""
 FRAMES = 40  # 3.3 m
 
 
@@ -200,11 +202,29 @@ def apart(state: SlamState) -> Pair:
     return pair_of([submap._replace(parent=None) for submap in state.submaps], (0, 1), CFG)
 
 
+def test_finish_solves_the_graph_by_finished_fields_before_it_aligns_the_frames(states, monkeypatch):
+    before, moved_to, seen = states[-1], maps.pose(translation=(1.0, 0.0, 0.0)), []
+
+    def closed_again(state: SlamState, cfg: Config) -> SlamState:
+        seen.append(state)
+        return state.with_submap(1, T_world_sub=moved_to)
+
+    monkeypatch.setattr(final, "closed_again", closed_again)
+    after = finish(before, CFG)
+    (given,) = seen
+    for old, new in zip(before.submaps, given.submaps, strict=True):
+        assert old.learned.field is not new.learned.field
+    poses = [np.stack([r.T_keyframe_cam for r in state.records]) for state in (before, given, after)]
+    np.testing.assert_array_equal(poses[1], poses[0])
+    assert (poses[2] != poses[0]).any()
+    np.testing.assert_array_equal(after.submaps[1].T_world_sub, moved_to)
+
+
 def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
     """Across the surface, which here is hardly more than a table top; also from a shared frame that is 4 cm off."""
     camera, pair = states[-1].camera, apart(states[-1])
-    factor = plane_factor(pair, True, camera, CFG)
-    assert factor is not None and len(factor.p_first) >= CFG.loop.fewest_points
+    factor = plane_factor(pair, True, camera, STIFF)
+    assert factor is not None and len(factor.p_first) >= STIFF.loop.fewest_points
     assert (factor.first, factor.second, factor.trusted) == (0, 1, True)
     # A tiny map is good to centimetres, and bends its walls by less than 0.3 rad
     on, above = (to_scene(sequence, factor.p_first + by * factor.n_first) for by in (0.0, 0.05))
@@ -219,15 +239,15 @@ def test_surfaces_of_two_submaps_measure_how_they_lie(states, sequence):
     for off in (0.0, 0.04):
         linked = moved(pair, off * up)
         T_linked = linked.link.T_first_second
-        found = plane_factor(linked, True, camera, CFG)
-        assert found is not None and abs(across(found, T_linked) - off) < CFG.loop.points_sigma
+        found = plane_factor(linked, True, camera, STIFF)
+        assert found is not None and abs(across(found, T_linked) - off) < STIFF.loop.points_sigma
         assert len(found.p_first) > 0.9 * len(factor.p_first), "at the first pose fewer meet than at the last"
-        T = solve(np.stack([np.eye(4), T_linked]), [pose_factor(linked, True, CFG), found]).T_world_sub[1]
-        assert across(found, T) < CFG.loop.points_sigma
+        T = solve(np.stack([np.eye(4), T_linked]), [pose_factor(linked, True, STIFF), found]).T_world_sub[1]
+        assert across(found, T) < STIFF.loop.points_sigma
         # The shared frame was right: the surfaces agree with it, or take it back
-        assert abs(up @ (T - pair.link.T_first_second)[:3, 3]) < CFG.loop.points_sigma
+        assert abs(up @ (T - pair.link.T_first_second)[:3, 3]) < STIFF.loop.points_sigma
     # Of those that could meet, a third does: too few to believe, though enough to align the two
-    assert plane_factor(moved(pair, 0.055 * up), True, camera, CFG) is None
+    assert plane_factor(moved(pair, 0.055 * up), True, camera, STIFF) is None
 
 
 def test_surfaces_say_nothing_along_the_chain(states):

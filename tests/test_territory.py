@@ -106,3 +106,16 @@ def test_a_frame_is_registered_again_while_that_moves_it(neighbours, monkeypatch
         np.testing.assert_allclose(start, where, atol=1e-6)
     assert found is not None
     np.testing.assert_allclose(found.T_sub_cam, ends[calls - 1], atol=1e-6)
+
+
+def test_a_frame_that_is_turned_is_registered_again_too(neighbours, monkeypatch):
+    guess = maps.pose((0.0, 30.0, 0.0), (1.0, 0.0, 0.0))
+    turned = guess @ maps.pose((0.0, 1.0, 0.0))
+    began = lands(monkeypatch, turned)
+    assert sight(neighbours, 0, neighbours.submap.keyframes[-1], Expected(guess), CFG) is not None
+    np.testing.assert_allclose(began, [guess, turned], atol=1e-6)
+
+
+def test_a_pose_that_is_not_finite_is_no_sighting(neighbours, monkeypatch):
+    lands(monkeypatch, np.full((4, 4), np.nan))
+    assert sight(neighbours, 0, neighbours.submap.keyframes[-1], Expected(np.eye(4)), CFG) is None

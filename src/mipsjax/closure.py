@@ -77,8 +77,7 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
     loops: list[tuple[Sighting, How]] = [pair for pair in found if pair[0].submap in new]
     if not loops and all(_agrees(state, sighting.submap, cfg) for sighting, _ in found):
         return state
-    doubtful = {loop.frame for loop in state.loops} | ({keyframe.number} if loops else set())
-    solved, weights = solve(state, cfg, frozenset(doubtful))
+    solved, weights = solve(state, cfg)
     if not weights:  # nothing was judged: what was found is forgotten, and may be found again
         for sighting, _ in loops:
             state = unlinked(state, sighting.submap, keyframe.number)
@@ -102,12 +101,12 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
 
 
 def closed_again(state: SlamState, cfg: Config) -> SlamState:
-    """After the last frame: the pose graph by all frames that submaps share and by finished surfaces, if any of its
-    edges says more than that one submap was begun from another."""
+    """After the last frame: the pose graph by all links and by finished surfaces, if it says more than which submap was
+    begun from which."""
     begun = {(submap.parent, place) for place, submap in enumerate(state.submaps)}
     if not cfg.loop.enabled or begun.issuperset(linked_pairs(state)):
         return state
-    return _judged(*solve(state, cfg, frozenset(loop.frame for loop in state.loops)))
+    return _judged(*solve(state, cfg))
 
 
 def _judged(state: SlamState, weights: dict[tuple[int, int], float]) -> SlamState:
@@ -119,17 +118,15 @@ def _judged(state: SlamState, weights: dict[tuple[int, int], float]) -> SlamStat
     return without_rejected(state, weights)._replace(loops=loops)
 
 
-def solve(
-    state: SlamState, cfg: Config, doubtful: frozenset[int] = frozenset()
-) -> tuple[SlamState, dict[tuple[int, int], float]]:
+def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[tuple[int, int], float]]:
     """Submap poses from all links and matched surfaces, and the weight of every linked pair. Fields stay as they are.
 
     Where no solution is found all stays as it was, and no pair is judged.
 
-    Only pairs far apart along the chain may be rejected, and those that share a `doubtful` frame, one that made a
-    loop: all others were seen from a pose that tracking had brought there. They are judged by their shared frames
-    alone, since surfaces that look alike match as well in the wrong place; the surfaces of those that are kept then
-    make them exact.
+    Only pairs far apart along the chain may be rejected, and nearer ones, of which none was begun from the other, that
+    share a frame with such a pair: all others were seen from a pose that tracking had brought there. They are judged
+    by their shared frames alone, since surfaces that look alike match as well in the wrong place; the surfaces of
+    those that are kept then make them exact.
     """
     from mipsjax.host.posegraph import (
         solve as solve_graph,
@@ -137,10 +134,13 @@ def solve(
 
     places = linked_pairs(state)
     pairs = [pair_of(state.submaps, place, cfg) for place in places]
-    near = {p: [n < cfg.loop.apart for n in chain_distances(state, p)] for p, _ in places}
+    shared = [{k.first.number for k in links(pair.first, pair.second)} for pair in pairs]
+    away = {p: chain_distances(state, p) for p, _ in places}
+    near = [away[j][k] < cfg.loop.apart for j, k in places]
+    doubtful = set[int]().union(*(frames for frames, beside in zip(shared, near, strict=True) if not beside))
     sure = [
-        near[j][k] and (pair.chained or pair.link.first.number not in doubtful)
-        for pair, (j, k) in zip(pairs, places, strict=True)
+        beside and (pair.chained or doubtful.isdisjoint(frames))
+        for pair, frames, beside in zip(pairs, shared, near, strict=True)
     ]
     frames = [pose_factor(pair, trusted, cfg) for pair, trusted in zip(pairs, sure, strict=True)]
     judged = solve_graph(np.stack([submap.T_world_sub for submap in state.submaps]), frames)

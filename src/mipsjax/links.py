@@ -36,16 +36,19 @@ def links(first: Submap, second: Submap) -> list[Link]:
 
 
 def best_link(first: Submap, second: Submap, chained: bool, cfg: Config) -> Link | None:
-    """Of two submaps of which one was begun from the other (`chained`), the one nearest to both anchors. Of others,
-    where each frame was registered on its own, the one that the others agree with best; the newer of two."""
+    """The frame that says how two submaps lie. If one was begun from the other (`chained`), the one nearest to both
+    anchors; of others, where frames are registered one by one, the one that the others agree with best, and of two the
+    newer: the first of a loop starts from the whole drift."""
     found = links(first, second)
     if not found or chained:
         return min(found, key=lambda link: link.reach, default=None)
-    return found[::-1][int(np.argmin(disagreement(found, cfg)[::-1]))]
+    if len(found) <= 2:
+        return max(found, key=lambda link: link.first.number)
+    return found[int(np.argmin(disagreement(found, cfg)))]
 
 
 def disagreement(found: list[Link], cfg: Config) -> Float64[np.ndarray, " N"]:
-    """Of each link, how far off it puts the frames of the others: the median, in standard deviations."""
+    """Of each link, how far off it puts the shared frames: the median over all, in standard deviations."""
     firsts, seconds = (np.stack([k.T_sub_cam for k in side]) for side in zip(*found, strict=True))
     loop = cfg.loop
     medians = []

@@ -17,7 +17,12 @@ from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
 
-AGAIN = 3  # times at most that a frame is registered once more; the second moves it by millimetres
+AGAIN = (
+    3  # times at most that a frame is registered once more; from 9 cm off the third moved it by millimetres
+)
+STILL = (
+    0.01  # metres, or as many times 1 rad, by which registration moves a frame that it need not move again
+)
 
 
 class Sighting(NamedTuple):
@@ -133,7 +138,7 @@ def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrins
 
     found = register(guess)
     for _ in range(AGAIN):
-        if max(distance(guess, found.T_sub_cam)) < cfg.loop.tolerance:
+        if max(distance(guess, found.T_sub_cam)) < STILL:
             break
         guess, found = found.T_sub_cam, register(found.T_sub_cam)
     return found
