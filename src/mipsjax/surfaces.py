@@ -30,7 +30,6 @@ class Pair(NamedTuple):
     second: Submap
     link: Link
     places: tuple[int, int]
-
     chained: bool
     """One was begun from the other."""
 
@@ -83,7 +82,7 @@ def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> 
 def prepare(submap: Submap, camera: Intrinsics, cfg: Config) -> None:
     """Compiles what two submaps will need, on one submap and itself."""
     anchor = submap.keyframes[0]
-    itself = Pair(submap, submap, Link(anchor, anchor), (0, 0), False)
+    itself = Pair(submap, submap, Link(anchor, anchor), (0, 0), chained=False)
     _matched(itself, _surface(itself, camera, cfg), np.eye(4), cfg)
 
 

@@ -17,12 +17,8 @@ from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
 
-AGAIN = (
-    3  # times at most that a frame is registered once more; from 9 cm off the third moved it by millimetres
-)
-STILL = (
-    0.01  # metres, or as many times 1 rad, by which registration moves a frame that it need not move again
-)
+AGAIN = 3  # times at most that registration is repeated: from 9 cm off the third moves a frame by millimetres
+STILL = 0.01  # metres, or as many times 1 rad: registration that moves a frame by less has ended
 
 
 class Sighting(NamedTuple):
