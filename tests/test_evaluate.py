@@ -2,6 +2,7 @@
 
 import json
 import re
+import tempfile
 
 import numpy as np
 import pytest
@@ -187,7 +188,33 @@ def test_faults_give_one_line_and_their_exit_code(case, tmp_path, capsys):
     assert word in captured.err and captured.out == ""
 
 
-def test_unknown_options_exit_with_two(capsys):
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        (["a", "b", "--thresold-m", "0.1"], "--threshold-m"),
+        (["a", "b", "--delta", "two"], "two"),
+        (["a"], "truth"),
+    ],
+)
+def test_wrong_options_give_one_line_and_exit_with_two(arguments, word, capsys):
+    assert evaluate.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and captured.err.startswith("error: ")
+    assert word in captured.err and captured.out == ""
+
+
+def test_a_bug_of_ours_is_one_line_and_its_traceback_is_in_a_file(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(evaluate, "evaluate", lambda options: 1 / 0)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert evaluate.main(["a", "b"]) == 1
+    (saved,) = tmp_path.iterdir()
+    assert "ZeroDivisionError" in saved.read_text()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and str(saved) in error
+
+
+def test_help_says_what_the_options_are(capsys):
     with pytest.raises(SystemExit) as stopped:
-        evaluate.main(["a", "b", "--no-such-option"])
-    assert stopped.value.code == 2
+        evaluate.main(["--help"])
+    assert stopped.value.code == 0
+    assert "--threshold-m" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The command line: options by dotted names over a file over a preset, and its errors in one line."""
+"""The command line: options by dotted names over a file over a preset, and how a program ends: with one line."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ import io
 import os
 import re
 import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import tyro
 
 from mipsjax.config import Config
 from mipsjax.data.open import parse_frames
-from mipsjax.errors import ConfigError
+from mipsjax.errors import ConfigError, MipsjaxError
 from mipsjax.options import flat, read_toml, suggestion, validate
 from mipsjax.presets import PRESETS, preset
 
 PROGRAM = "python -m mipsjax.run"
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+AnyOptions = TypeVar("AnyOptions")
 # An option that is given or not; the other switches have a `no-` form too
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -66,13 +72,80 @@ def parse(arguments: list[str]) -> Options:
     Raises:
         ConfigError: an option, the preset or the config file is wrong.
     """
-    options = _read(arguments, _base(arguments))
+    names = ["--" + name for name, _ in flat(Config())]
+    names += ["--" + item.name for item in fields(Options) if item.name not in ("sequence", "settings")]
+    default = Options(sequence=tyro.MISSING, settings=_base(arguments))
+    missing = "no sequence given; pass a folder, or synth:room for a built-in one"
+    options = read_options(Options, PROGRAM, arguments, names, missing, default)
     if options.no_loop:
         loop = replace(options.settings.loop, enabled=False)
         options = replace(options, settings=replace(options.settings, loop=loop))
     validate(options.settings)
     parse_frames(options.frames)
     return options
+
+
+def read_options(
+    kind: type[AnyOptions],
+    program: str,
+    arguments: list[str],
+    names: Iterable[str],
+    missing: str,
+    default: AnyOptions | None = None,
+) -> AnyOptions:
+    """The command line over `default`. `names` are those of all options, `missing` what to say where what is not
+    optional lacks.
+
+    Raises:
+        ConfigError: with one line.
+    """
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            if default is None:
+                return tyro.cli(kind, prog=program, args=arguments)
+            return tyro.cli(kind, prog=program, args=arguments, default=default)
+    except SystemExit as exit:
+        if exit.code in (0, None):
+            raise
+        raise ConfigError(_one_line(arguments, errors.getvalue(), names, missing)) from None
+
+
+def ended(program: Callable[[], int]) -> int:
+    """Calls a program and returns its exit code. Its errors are one line on stderr."""
+    try:
+        with bugs_saved_in(Path(tempfile.gettempdir())):
+            return program()
+    except MipsjaxError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+@contextlib.contextmanager
+def bugs_saved_in(folder: Path) -> Iterator[None]:
+    """Turns an unforeseen exception into one line and a file with its traceback."""
+    try:
+        yield
+    except MipsjaxError:
+        raise
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}".splitlines()[0]
+        path = folder / f"mipsjax-error-{os.getpid()}.txt"
+        try:
+            path.write_text(traceback.format_exc(), encoding="utf-8")
+            where = f"its traceback is in {path}"
+        except OSError as failure:
+            where = f"its traceback cannot be written ({failure.strerror})"
+        raise _BugError(f"a bug of mipsjax, please report it: {text}; {where}") from error
+
+
+class _BugError(MipsjaxError):
+    """A bug of ours, with its traceback saved."""
+
+    exit_code = 1
 
 
 def say(text: str) -> None:
@@ -96,23 +169,8 @@ def _base(arguments: list[str]) -> Config:
     return base if named.config is None else read_toml(named.config, base)
 
 
-def _read(arguments: list[str], base: Config) -> Options:
-    """The command line over a config. Raises ConfigError with one line."""
-    default = Options(sequence=tyro.MISSING, settings=base)
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            return tyro.cli(Options, prog=PROGRAM, args=arguments, default=default)
-    except SystemExit as exit:
-        if exit.code in (0, None):
-            raise
-        raise ConfigError(_one_line(arguments, errors.getvalue())) from None
-
-
-def _one_line(arguments: list[str], text: str) -> str:
+def _one_line(arguments: list[str], text: str, names: Iterable[str], missing: str) -> str:
     """What is wrong with a command line, from the message of tyro, which fills a screen."""
-    names = ["--" + name for name, _ in flat(Config())]
-    names += ["--" + item.name for item in fields(Options) if item.name not in ("sequence", "settings")]
     known = {name.replace("_", "-") for name in names} | {"--help"}
     for argument in arguments:
         name = argument.split("=", 1)[0].replace("_", "-")
@@ -120,7 +178,7 @@ def _one_line(arguments: list[str], text: str) -> str:
         if name.startswith("--") and name not in known and plain not in known:
             return f"unknown option {name}{suggestion(name, sorted(known))}"
     if "Missing from" in text:
-        return "no sequence given; pass a folder, or synth:room for a built-in one"
+        return missing
     return _first_block(text) or "wrong options"
 
 

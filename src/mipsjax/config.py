@@ -1,6 +1,6 @@
 """Configuration: frozen dataclasses.
 
-Every number of the method is a field here. The `paper` preset holds the numbers of MIPS-Fusion (SIGGRAPH Asia
+The numbers of the method. The `paper` preset holds the numbers of MIPS-Fusion (SIGGRAPH Asia
 2023); where the paper gives none, and where a departure is better on two CPU cores, the docstring says why.
 """
 
@@ -54,26 +54,32 @@ class FieldConfig:
     classification: bool = True
     """Off: the distance is regressed (the paper's ablation "No C")."""
     classes: int = 5
+    """Of the distance, evenly from -`truncation` to `truncation`."""
     coldness: float = 1.0
     """beta of the soft argmax (Eq. 2; paper: 10, on outputs that sum to 1)."""
     normalised: bool = False
     """The outputs z are normalised to sum to 1 before the soft argmax, as in the paper. Its two softmaxes in a
     row saturate: the sinusoidal field then stays at one class (docs/method.md)."""
     octaves: int = 6
+    """Of the sinusoids, for each coordinate."""
     longest_wavelength: float = 8.0
     """Metres, of the first octave; about the largest side of a submap."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers behind the sinusoids; the paper gives none."""
     hash_levels: int = 6
+    """Grids, from the coarsest to the finest."""
     hash_log2_entries: int = 15
     """Each level has 2 to this many entries."""
     hash_features: int = 2
+    """Numbers in an entry."""
     hash_coarsest: float = 0.44
     """Metres, edge of a cell of the first level."""
     hash_finest: float = 0.035
     """Metres, edge of a cell of the last level."""
     hash_hidden: tuple[int, ...] = (32, 32)
+    """Widths of the hidden layers behind the hash grid."""
     color_hidden: tuple[int, ...] = (32,)
+    """Widths of the hidden layers of the colour network."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +103,11 @@ class LossConfig:
     """Weights of the mapping loss."""
 
     tr: float = 1000.0
+    """Of the distance in the truncation region (Eq. 9)."""
     fs: float = 10.0
+    """Of the distance in free space (Eq. 11)."""
     rgb: float = 1.0
+    """Of colour (Eq. 12)."""
     emd: float = 0.01
     """Of both distribution terms; the paper gives none, its released code has 0.01."""
     cross_entropy: float = 3.0
@@ -136,6 +145,7 @@ class MapConfig:
     pixels: int = 256
     """Of each frame in each step (paper: 384)."""
     learning_rate: float = 1e-2
+    """Of Adam on the networks."""
     momentum: float = 0.8
     """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
     pose_learning_rate: float = 5e-4
@@ -170,8 +180,11 @@ class SearchConfig:
     when: Literal["always", "needed", "never"] = "needed"
     """`needed`: only when gradient-based optimisation alone has not converged."""
     particles: int = 1024
+    """Poses in the swarm (paper: 2048)."""
     pixels: int = 96
+    """On which each is judged (paper: 384)."""
     steps: int = 8
+    """Of the swarm (paper: 10)."""
     rotation: float = 0.12
     """First radius of the swarm in the imaginary part of the quaternion, half the angle in radians."""
     translation: float = 0.25
@@ -204,7 +217,9 @@ class RefineConfig:
     method: Literal["adam", "lm", "never"] = "lm"
     """`adam` on d2t + rgb as in the paper; `lm`: robust second-order steps on d2t."""
     pixels: int = 2304
+    """Of the steps on the fine field, and of the status (paper: 384)."""
     steps: int = 10
+    """On the fine field."""
     smooth_pixels: int = 768
     """For the choice among the candidates of the motion prior, and for steps on the smooth field where there is one
     besides the fine one: before the others, where those alone have not converged."""

@@ -90,7 +90,8 @@ class LoopConfig:
     effective_points: float = 20.0
     """Matched points that count as independent: neighbours share their error."""
     tolerance: float = 0.01
-    """Metres (or as many times 1 rad) by which a frame's poses in two submaps may differ before the graph is solved."""
+    """Metres (or as many times 1 rad) by which a frame's poses in two submaps may differ before the graph is solved,
+    which it is for each new loop as well."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -16,19 +16,17 @@ import trimesh
 import tyro
 from jaxtyping import Float64
 
-from mipsjax.commandline import say
+from mipsjax.commandline import ended, read_options, say
 from mipsjax.data.association import associate, sort_stamps
 from mipsjax.data.textfile import content_lines
 from mipsjax.data.trajectory import Trajectory, read_matrix_rows, read_tum
-from mipsjax.errors import ConfigError, InputError, MipsjaxError
+from mipsjax.errors import ConfigError, InputError
 from mipsjax.files import write_atomically
 from mipsjax.host import metrics, surface
 from mipsjax.options import LARGEST_SEED
 
 MATRIX_COLUMNS = 16
 """Numbers in a row of a file of 4 x 4 matrices; a TUM row has 8."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 @dataclass(frozen=True)
@@ -240,17 +238,17 @@ def write_json(path: Path, rows: list[Row]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The program; returns its exit code. Wrong options exit with 2 on their own."""
-    options = tyro.cli(Options, prog="python -m mipsjax.evaluate", args=arguments)
-    try:
-        rows = evaluate(options)
-        if options.json is not None:
-            write_json(options.json, rows)
-    except MipsjaxError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    """The program; returns its exit code. Errors are one line on stderr."""
+    return ended(lambda: _main(sys.argv[1:] if arguments is None else arguments))
+
+
+def _main(arguments: list[str]) -> int:
+    names = ["--" + item.name for item in fields(Options)]
+    missing = "two trajectories are needed: the estimate, and the truth"
+    options = read_options(Options, "python -m mipsjax.evaluate", arguments, names, missing)
+    rows = evaluate(options)
+    if options.json is not None:
+        write_json(options.json, rows)
     say(format_table(rows))
     return 0
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import os
 import signal
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
@@ -21,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mipsjax import outputs, slam
-from mipsjax.commandline import Options, parse, say
+from mipsjax.commandline import INTERRUPTED, Options, bugs_saved_in, ended, parse, say
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
@@ -34,8 +31,6 @@ from mipsjax.schedule import executor
 from mipsjax.state import FrameInfo, Pose, SlamState
 from mipsjax.summary import FrameRow, Run, verdict
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 LINE_EVERY = 50
 """Frames between two lines of progress where there is no terminal."""
 MIN_USABLE = 2
@@ -44,16 +39,7 @@ MIN_USABLE = 2
 
 def main(arguments: list[str] | None = None) -> int:
     """The program; returns its exit code. Errors are one line on stderr."""
-    try:
-        with _bugs_saved_in(Path(tempfile.gettempdir())):
-            options = parse(sys.argv[1:] if arguments is None else arguments)
-            return _inspect(options) if options.inspect else _run(options)
-    except MipsjaxError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+    return ended(lambda: _main(sys.argv[1:] if arguments is None else arguments))
 
 
 def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Callable[[Status], None]) -> Run:
@@ -92,6 +78,11 @@ def travel(sequence: Sequence, cfg: Config, stop: Callable[[], bool], tell: Call
     return Run(sequence, state, tuple(waited), tuple(read_s), tuple(step_s), end, finish_s)
 
 
+def _main(arguments: list[str]) -> int:
+    options = parse(arguments)
+    return _inspect(options) if options.inspect else _run(options)
+
+
 def _run(options: Options) -> int:
     """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
     cfg, tell = options.settings, _teller(options.quiet)
@@ -100,7 +91,7 @@ def _run(options: Options) -> int:
     sequence = _open(options)
     opened_s = perf_counter() - began
     folder = outputs.choose_folder(sequence.name, options.out, _source(options))
-    with outputs.claimed(folder), _bugs_saved_in(folder), _warnings(tell) as remarks, _signals() as stop:
+    with outputs.claimed(folder), bugs_saved_in(folder), _warnings(tell) as remarks, _signals() as stop:
         outputs.write_config(folder, cfg, _plain_options(options), sequence)
         tell("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
         with _progress(len(sequence), options.quiet) as tell_status:
@@ -273,30 +264,6 @@ def _warnings(tell: Callable[[str], None]) -> Iterator[list[str]]:
         yield texts
     finally:
         logger.removeHandler(handler)
-
-
-class _BugError(MipsjaxError):
-    """A bug of ours, with its traceback saved."""
-
-    exit_code = 1
-
-
-@contextmanager
-def _bugs_saved_in(folder: Path) -> Iterator[None]:
-    """Turns an unforeseen exception into one line and a file with its traceback."""
-    try:
-        yield
-    except MipsjaxError:
-        raise
-    except Exception as error:
-        text = f"{type(error).__name__}: {error}".splitlines()[0]
-        path = folder / f"mipsjax-error-{os.getpid()}.txt"
-        try:
-            path.write_text(traceback.format_exc(), encoding="utf-8")
-            where = f"its traceback is in {path}"
-        except OSError as failure:
-            where = f"its traceback cannot be written ({failure.strerror})"
-        raise _BugError(f"a bug of mipsjax, please report it: {text}; {where}") from error
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from mipsjax.schedule import Job
 Pose = Float64[np.ndarray, "4 4"]
 How = Literal["box", "features"]
 
-THUMBNAIL_WIDTH = 48  # pixels, about; 4 kB a frame
+THUMBNAIL_WIDTH = 48  # pixels, about; 3 kB a frame
 THUMBNAIL_UNIT = 2e-4  # metres; 16 bits then reach 13 m
 
 

@@ -28,7 +28,7 @@ from mipsjax.data.synth.render import pixel_rays, render
 from mipsjax.data.synth.rooms import PAINTS, living_room
 from mipsjax.data.synth.scene import Scene
 from mipsjax.data.synth.sensor import SensorModel, depth_sigma, incidence, measured_color, measured_depth
-from mipsjax.errors import InputError, OutputError
+from mipsjax.errors import ConfigError, InputError, OutputError
 
 ALL = slice(None)
 SMALL = Intrinsics(65.625, 65.625, 39.5, 29.5, 80, 60)
@@ -467,5 +467,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["tiny", str(tmp_path / "full")]) == OutputError.exit_code
     (tmp_path / "file").write_text("")
     assert main(["tiny", str(tmp_path / "file" / "new")]) == OutputError.exit_code
+    assert main(["tiny"]) == ConfigError.exit_code
+    assert main(["tiny", str(tmp_path / "new"), "--voxel", "small"]) == ConfigError.exit_code
     errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 3 and all(line.startswith("error: ") for line in errors)
+    assert len(errors) == 5 and all(line.startswith("error: ") for line in errors)

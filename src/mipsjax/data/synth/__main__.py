@@ -5,18 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 from mipsjax.config import InputConfig
 from mipsjax.data.open import parse_frames
 from mipsjax.data.synth import open_synth, synth_names
 from mipsjax.data.synth.export import export_tum
-from mipsjax.errors import MipsjaxError
+from mipsjax.errors import ConfigError, MipsjaxError
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0, or that of the error, whose one line goes to stderr."""
-    options = _parser().parse_args(arguments)
     try:
+        options = _parser().parse_args(arguments)
         sequence = open_synth(options.name, parse_frames(options.frames), InputConfig())
         export_tum(sequence, options.out, None if options.no_mesh else options.voxel)
     except MipsjaxError as error:
@@ -26,9 +27,16 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """Wrong options are an error of one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(message)
+
+
 def _parser() -> argparse.ArgumentParser:
     names = "; ".join(f"{name}: {about}" for name, about in synth_names().items())
-    parser = argparse.ArgumentParser(prog="python -m mipsjax.data.synth", description=__doc__)
+    parser = _Parser(prog="python -m mipsjax.data.synth", description=__doc__)
     parser.add_argument(
         "name", help=f"{names}. With +noise or +blur or both behind it, a real camera's errors"
     )
