@@ -167,6 +167,19 @@ def test_track_starts_from_the_better_candidate(corner_map, frame):
     assert apart(one, TRUTH)[0] < TOLERANCE_M
 
 
+@pytest.mark.parametrize("good_first", [True, False])
+def test_go_starts_from_every_candidate(corner_map, frame, lm, good_first):
+    """Where the smooth field cannot tell them apart, the end that fits better is taken."""
+    good, bad = TRUTH @ NEAR, TRUTH @ FAR[0]
+    assert apart(lm([bad])[0], TRUTH)[0] > 0.02
+    assert corner_map.field.smooth is not None
+    blank = corner_map.field._replace(smooth=jax.tree.map(jnp.zeros_like, corner_map.field.smooth))
+    T, info = track(blank, frame, *((good, bad) if good_first else (bad, good)))
+    metres, degrees = apart(T, TRUTH)
+    assert not info.searched
+    assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
+
+
 @pytest.mark.parametrize("offset", range(len(FAR)))
 def test_the_search_recovers_what_lm_alone_does_not(corner_map, frame, lm, offset):
     start = TRUTH @ FAR[offset]

@@ -247,10 +247,10 @@ def track(
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to.
 
-    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from the best candidate.
-    Where that ends above the residual `converged` (metres, `track.ro.residual` if not given), GO by way of the smooth
-    field follows, and where that does too, RO then GO; the better end is kept. `widening` is a factor on the swarm's
-    first radii.
+    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from every candidate and
+    the better end is kept: where surfaces hardly hold a frame it ends near where it began. Where that is above the
+    residual `converged` (metres, `track.ro.residual` if not given), GO by way of the smooth field follows, and where
+    that is too, RO then GO; the better end is kept. `widening` is a factor on the swarm's first radii.
     """
     k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
     ro, go = cfg.track.ro, cfg.track.go
@@ -279,6 +279,12 @@ def track(
     def searched(T):
         return far(search(field, depth, color, T, widening, k_ro, camera, cfg))
 
+    def nearest():
+        """The best of GO from every candidate."""
+        ends = jax.vmap(near)(candidates)
+        best = jnp.argmin(jnp.where(jnp.isfinite(ends[1].residual), ends[1].residual, jnp.inf))
+        return jax.tree.map(lambda each: each[best], ends)
+
     def tried(attempt, found):
         """The better of what was found and of another attempt, where the first has not converged; and whether."""
         fit = found[1]
@@ -295,7 +301,7 @@ def track(
     if ro.when == "always":
         T, after = searched(start)
     else:
-        found = near(start)
+        found = nearest()
         if smooth:
             found, _ = tried(far, found)
         if ro.when == "needed":
