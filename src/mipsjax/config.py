@@ -284,6 +284,10 @@ class TrackConfig:
 
     ro: SearchConfig = SearchConfig()
     go: RefineConfig = RefineConfig()
+    rest: float = 0.9
+    """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
+    velocity; 1 is whichever is less. A camera that surfaces hardly hold fits almost alike at rest, and would be left
+    there."""
 
 
 @dataclass(frozen=True)

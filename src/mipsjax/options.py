@@ -122,6 +122,7 @@ RANGES: dict[str, Range] = {
     "track.go.view_robust": POSITIVE,
     "track.go.view_translation": NOT_NEGATIVE,
     "track.go.view_rotation": NOT_NEGATIVE,
+    "track.rest": SHARE,
     "keyframe.error": POSITIVE,
     "keyframe.known": SHARE,
     "keyframe.every_frames": COUNT,

@@ -167,17 +167,19 @@ def test_track_starts_from_the_better_candidate(corner_map, frame):
     assert apart(one, TRUTH)[0] < TOLERANCE_M
 
 
-@pytest.mark.parametrize("good_first", [True, False])
-def test_go_starts_from_every_candidate(corner_map, frame, lm, good_first):
-    """Where the smooth field cannot tell them apart, the end that fits better is taken."""
-    good, bad = TRUTH @ NEAR, TRUTH @ FAR[0]
-    assert apart(lm([bad])[0], TRUTH)[0] > 0.02
-    assert corner_map.field.smooth is not None
-    blank = corner_map.field._replace(smooth=jax.tree.map(jnp.zeros_like, corner_map.field.smooth))
-    T, info = track(blank, frame, *((good, bad) if good_first else (bad, good)))
-    metres, degrees = apart(T, TRUTH)
-    assert not info.searched
-    assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
+@pytest.mark.parametrize(("metres", "share", "left"), [(0.085, (0.93, 0.99), False), (0.01, (0, 0.8), True)])
+def test_the_first_candidate_is_left_for_one_that_fits_clearly_better(
+    corner_map, frame, points, metres, share, left
+):
+    first, other = (TRUTH @ pose((0, 0, 0), (0, 0, d)) for d in (0.1, metres))
+    misfit, misfit_other = (
+        tracking.measure_fit(corner_map.field, jnp.asarray(T, jnp.float32), points, "search", CFG).residual
+        for T in (first, other)
+    )
+    assert share[0] < misfit_other / misfit < share[1]
+    begun = track(corner_map.field, frame, first, other)[1].before
+    alone = track(corner_map.field, frame, *[other if left else first] * 2)[1].before
+    assert begun.residual == alone.residual
 
 
 @pytest.mark.parametrize("offset", range(len(FAR)))

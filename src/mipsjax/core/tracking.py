@@ -52,7 +52,7 @@ class TrackInfo(NamedTuple):
     """What happened to one frame."""
 
     before: Fit
-    """At the better of the candidates."""
+    """At the candidate it starts from."""
     after: Fit
     searched: Bool[Array, ""]
     """RO was run."""
@@ -247,17 +247,18 @@ def track(
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to.
 
-    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO starts from every candidate and
-    the better end is kept: where surfaces hardly hold a frame it ends near where it began. Where that is above the
-    residual `converged` (metres, `track.ro.residual` if not given), GO by way of the smooth field follows, and where
-    that is too, RO then GO; the better end is kept. `widening` is a factor on the swarm's first radii.
+    It starts from the first candidate, or from another that fits the smooth field clearly better (`track.rest`): where
+    surfaces hardly hold a frame, all of them fit alike. With `track.ro.when = "always"` this is the paper's RO then GO.
+    With "needed", GO comes first. Where that ends above the residual `converged` (metres, `track.ro.residual` if not
+    given), GO by way of the smooth field follows, and where that does too, RO then GO; the better end is kept.
+    `widening` is a factor on the swarm's first radii.
     """
     k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
     ro, go = cfg.track.ro, cfg.track.go
     points = draw_points(k_go, depth, color, go.pixels, camera)
     coarse = draw_points(k_smooth, depth, color, go.smooth_pixels, camera)
     search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
-    start = candidates[jnp.argmin(search_cost)]
+    start = candidates[jnp.argmin(search_cost.at[0].multiply(cfg.track.rest))]
     before = measure_fit(field, start, points, "whole", cfg)
     view_camera = None if views is None else camera.decimated(round(camera.width / views.depth.shape[2]))
 
@@ -279,12 +280,6 @@ def track(
     def searched(T):
         return far(search(field, depth, color, T, widening, k_ro, camera, cfg))
 
-    def nearest():
-        """The best of GO from every candidate."""
-        ends = jax.vmap(near)(candidates)
-        best = jnp.argmin(jnp.where(jnp.isfinite(ends[1].residual), ends[1].residual, jnp.inf))
-        return jax.tree.map(lambda each: each[best], ends)
-
     def tried(attempt, found):
         """The better of what was found and of another attempt, where the first has not converged; and whether."""
         fit = found[1]
@@ -301,7 +296,7 @@ def track(
     if ro.when == "always":
         T, after = searched(start)
     else:
-        found = nearest()
+        found = near(start)
         if smooth:
             found, _ = tried(far, found)
         if ro.when == "needed":
