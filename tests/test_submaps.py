@@ -14,7 +14,7 @@ import maps
 from compilations import compilations
 from mipsjax import closure, final, recovery, schedule, slam, territory
 from mipsjax.bundle import make_keyframe
-from mipsjax.config import Config, InputConfig
+from mipsjax.config import Config, GuardConfig, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
 from mipsjax.core import mapping, volume
 from mipsjax.data.sequence import Frame
@@ -311,14 +311,16 @@ def test_without_loops_submaps_stay_where_they_were_begun(frames, sequence):
         np.testing.assert_array_equal(one.T_world_sub, other.T_world_sub)
 
 
-def test_a_frame_of_nowhere_is_lost_or_never_trusted(states, frames):
-    """Depth of a wall 30 cm away, all in one colour: nothing of the map."""
-    color = np.full_like(frames[0].color, 90)
-    wall = frames[-1]._replace(
-        depth=np.full_like(frames[0].depth, 0.3), color=color, number=99, timestamp=99.0
-    )
-    after = slam.step(states[-1], wall, CFG)
-    assert after.records[-1].status is not Status.OK
+# Half of the wall fits another wall, which this preset's loose guards take for a weak frame
+@pytest.mark.parametrize(("depth", "guard"), [("wall", GuardConfig()), ("noise", CFG.guard)])
+def test_a_frame_of_nowhere_is_lost(states, frames, depth, guard):
+    """A wall 30 cm away, or what no surface looks like, all in one colour."""
+    shape, color = frames[0].depth.shape, np.full_like(frames[0].color, 90)
+    noise = np.random.default_rng(0).uniform(0.3, 3, shape).astype(np.float32)
+    values = np.full(shape, 0.3, np.float32) if depth == "wall" else noise
+    nowhere = frames[-1]._replace(depth=values, color=color, number=99, timestamp=99.0)
+    after = slam.step(states[-1], nowhere, replace(CFG, guard=guard))
+    assert after.records[-1].status is Status.LOST
     assert len(after.submaps) == len(states[-1].submaps)
 
 
