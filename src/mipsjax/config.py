@@ -286,8 +286,8 @@ class TrackConfig:
     go: RefineConfig = RefineConfig()
     rest: float = 0.9
     """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
-    velocity; 1 is whichever is less. A camera that surfaces hardly hold fits almost alike at rest, and would be left
-    there."""
+    velocity; 1 takes whichever is less, 0 never rest. A camera that surfaces hardly hold fits almost alike at rest, and
+    would be left there."""
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ def test_the_smooth_field_has_no_part_where_the_fine_one_is_enough(corner_map, f
     np.testing.assert_array_equal(T, with_blank)
 
 
-def test_track_starts_from_the_better_candidate(corner_map, frame):
+def test_the_order_of_candidates_does_not_matter_where_one_is_clearly_better(corner_map, frame):
     good, bad = TRUTH @ NEAR, TRUTH @ pose((0, 40, 0), (0.5, 0, 0))
     one, _ = track(corner_map.field, frame, good, bad)
     other, _ = track(corner_map.field, frame, bad, good)
@@ -171,6 +171,7 @@ def test_track_starts_from_the_better_candidate(corner_map, frame):
 def test_the_first_candidate_is_left_for_one_that_fits_clearly_better(
     corner_map, frame, points, metres, share, left
 ):
+    """Metres along the view. Shares keep off `track.rest`: `track` draws other points than these."""
     first, other = (TRUTH @ pose((0, 0, 0), (0, 0, d)) for d in (0.1, metres))
     misfit, misfit_other = (
         tracking.measure_fit(corner_map.field, jnp.asarray(T, jnp.float32), points, "search", CFG).residual

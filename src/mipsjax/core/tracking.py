@@ -247,11 +247,12 @@ def track(
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to.
 
-    It starts from the first candidate, or from another that fits the smooth field clearly better (`track.rest`): where
-    surfaces hardly hold a frame, all of them fit alike. With `track.ro.when = "always"` this is the paper's RO then GO.
-    With "needed", GO comes first. Where that ends above the residual `converged` (metres, `track.ro.residual` if not
-    given), GO by way of the smooth field follows, and where that does too, RO then GO; the better end is kept.
-    `widening` is a factor on the swarm's first radii.
+    The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
+    field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
+
+    With `track.ro.when = "always"` this is the paper's RO then GO. With "needed", GO comes first. Where that ends above
+    the residual `converged` (metres, `track.ro.residual` if not given), GO by way of the smooth field follows, and
+    where that does too, RO then GO; the better end is kept. `widening` is a factor on the swarm's first radii.
     """
     k_go, k_smooth, k_ro, k_adam = jax.random.split(key, 4)
     ro, go = cfg.track.ro, cfg.track.go
