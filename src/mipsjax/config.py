@@ -287,7 +287,7 @@ class TrackConfig:
     rest: float = 0.9
     """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
     velocity; 1 takes whichever is less, 0 never rest. A camera that surfaces hardly hold fits almost alike at rest, and
-    would be left there."""
+    would be left there. After a gap of more than five intervals between frames it is the other way round."""
 
 
 @dataclass(frozen=True)

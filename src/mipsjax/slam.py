@@ -243,12 +243,16 @@ def _coast(
 
 
 def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
-    """Constant velocity over the real time since the last trusted frame, and no motion."""
+    """Constant velocity over the real time since the last trusted frame, and no motion; the expected one first.
+
+    Over a longer time than velocity is carried on for, it says nothing, and no motion comes first.
+    """
     last = last_pose(state)
     if state.motion is None:
         return [last, last]
     ratio = (timestamp - _last_trusted(state).timestamp) / max(state.motion.seconds, DT_MIN)
-    return [last @ _scaled(state.motion.T_older_newer, min(max(ratio, 0.0), DT_RATIO_MAX)), last]
+    moved = last @ _scaled(state.motion.T_older_newer, min(max(ratio, 0.0), DT_RATIO_MAX))
+    return [moved, last] if ratio <= DT_RATIO_MAX else [last, moved]
 
 
 def _last_trusted(state: SlamState) -> Record:
