@@ -21,10 +21,7 @@ settings.load_profile("fixed")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line(
-        "filterwarnings", "ignore:Error (reading|writing) persistent compilation cache entry"
-    )
+def pytest_configure() -> None:
     enable_cache()
 
 
