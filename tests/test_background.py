@@ -16,6 +16,8 @@ from mipsjax.core import mapping
 from mipsjax.presets import PRESETS
 from mipsjax.state import Submap
 
+pytestmark = pytest.mark.slow
+
 CFG = replace(Config(), background=BackgroundConfig(every_frames=4, steps=10))
 
 

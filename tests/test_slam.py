@@ -18,6 +18,8 @@ from mipsjax.policy import Status
 from mipsjax.presets import PRESETS
 from mipsjax.state import Motion, SlamState, trajectory
 
+pytestmark = pytest.mark.slow
+
 CFG = PRESETS["tiny"]
 FRAMES = 6
 

@@ -32,6 +32,8 @@ from mipsjax.state import SlamState, Submap, distance, pose_of, trajectory, worl
 from mipsjax.surfaces import Pair, pair_of, plane_factor, pose_factor
 from mipsjax.territory import Sighting, enter
 
+pytestmark = pytest.mark.slow
+
 CFG = replace(
     PRESETS["tiny"],
     # Views cut short and boxes so small that two metres of motion need a second one

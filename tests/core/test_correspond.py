@@ -15,6 +15,8 @@ from planes import REGRESSED, TAU, UNCERTAIN, plane
 from mipsjax.core import mapping
 from mipsjax.core.correspond import Matches, Surface, fixed_size, match, residuals, surface_points
 
+pytestmark = pytest.mark.slow
+
 COUNT = 64
 SMALL = replace(planes.CFG, correspond=replace(planes.CFG.correspond, points=COUNT))
 NORMAL, OFFSET = np.array([2.0, -1.0, 2.0]) / 3, 0.4

@@ -13,11 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mipsjax.compilation import enable_cache
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
 from mipsjax.presets import PRESETS
+
+pytestmark = pytest.mark.slow
 
 CFG = PRESETS["tiny"]
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)

@@ -25,6 +25,8 @@ from mipsjax.data.synth.rooms import PAINTS, living_room
 from mipsjax.data.synth.scene import Scene
 from mipsjax.data.synth.walk import Gait, walk
 
+pytestmark = pytest.mark.slow
+
 ALL = slice(None)
 SMALL = QVGA.resized(64, 48)
 LARGE = ("apartment", "corridor-loop", "no-loop")
