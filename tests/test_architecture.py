@@ -20,7 +20,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
     frozenset({"state", "rest"}),
-    frozenset({"bundle", "links"}),
+    frozenset({"bundle", "landmarks", "links"}),
     frozenset({"territory", "background", "surfaces"}),
     frozenset({"closure"}),
     frozenset({"recovery"}),

@@ -148,8 +148,9 @@ class MapConfig:
     """Of Adam on the networks."""
     momentum: float = 0.8
     """beta 1 of Adam on the networks (paper: none given, 0.9 is usual)."""
-    pose_learning_rate: float = 5e-4
-    """Of the twist of each frame, metres and radians."""
+    pose_learning_rate: float = 0.0
+    """Of the twist of each frame, metres and radians (paper: 1e-3); 0 leaves poses as tracked. They are moved by the
+    smooth field, whose surface is 4 to 10 mm off: a moving camera is turned by it, always the same way."""
     pose_rate_slow: float = 0.0
     """Share of that rate where the camera has hardly moved, and after the last frame: Adam's steps are as long as
     its rate however small the gradient, and would shake poses that are known to a millimetre. 1 is the paper."""
@@ -279,11 +280,31 @@ class GuardConfig:
 
 
 @dataclass(frozen=True)
+class CornerConfig:
+    """Corners of the image, a term beside d2t in the second-order steps on the fine field: they hold the camera where
+    surfaces leave a direction free. In place of the photometric term of the paper."""
+
+    count: int = 400
+    """Followed from each earlier frame; 0 is none."""
+    keyframes: int = 2
+    """The newest ones, from which corners are followed beside the last frame."""
+    fewest: int = 12
+    """Corners of one frame that must agree on a motion; fewer are not used."""
+    noise_px: float = 0.7
+    """Standard deviation of a followed corner."""
+    robust: float = 2.0
+    """Such deviations, scale of the Cauchy weight."""
+    weight: float = 0.5
+    """Of a corner, relative to a point of the map at the same standard deviation: neighbours err together."""
+
+
+@dataclass(frozen=True)
 class TrackConfig:
     """RO, then GO."""
 
     ro: SearchConfig = SearchConfig()
     go: RefineConfig = RefineConfig()
+    corners: CornerConfig = CornerConfig()
     rest: float = 0.9
     """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
     velocity; 1 takes whichever is less, 0 never rest. A camera that surfaces hardly hold fits almost alike at rest, and

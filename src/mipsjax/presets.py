@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mipsjax.config import (
     Config,
+    CornerConfig,
     FieldConfig,
     GuardConfig,
     KeyframeConfig,
@@ -49,6 +50,7 @@ PAPER = Config(
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
         go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
+        corners=CornerConfig(count=0),
     ),
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),

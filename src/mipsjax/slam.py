@@ -22,6 +22,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
+from mipsjax.landmarks import follow_all, landmarks, with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, converged, decide, widening
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.schedule import INLINE, Executor
@@ -61,7 +62,7 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
         keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
     )
     record = Record(frame.number, frame.timestamp, 0, 0, np.eye(4), Status.OK, info)
-    state = SlamState((submap,), 0, (record,), camera, 0)
+    state = with_corners(SlamState((submap,), 0, (record,), camera, 0), frame.cleaned(), cfg)
     prepare(state, cfg)
     return state
 
@@ -99,6 +100,7 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
         frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
     state = _moved_on(learned, state, float(info.after.residual)) if decision.tells else learned
+    state = with_corners(state, frame, cfg)
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
     return refine_inactive(state, cfg, executor)
@@ -144,17 +146,23 @@ def _recover(
 def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.TrackInfo]:
     assert frame.depth is not None
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
+    candidates = _candidates(state, frame.timestamp)
+    found = follow_all(state, frame, candidates[0], cfg)
+    if found:
+        # What was measured between two images is a better guess than that the camera has gone on as before
+        candidates = [found[0].T_sub_cam, candidates[0]]
     T, info = tracking.track(
         state.submap.learned.field,
         frame.depth,
         color,
-        np.stack(_candidates(state, frame.timestamp)).astype(np.float32),
+        np.stack(candidates).astype(np.float32),
         np.float32(widening(state.trouble, cfg)),
         random_key(cfg, TRACK, len(state.records)),
         state.camera,
         cfg,
         _views(state, cfg),
         np.float32(converged(state.residual, cfg)),
+        landmarks(found, state.camera, cfg),
     )
     T, info = jax.device_get((T, info))
     return rigid(T), info

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32, Float64, UInt8, UInt16
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.volume import Box
+from mipsjax.host.corners import Corners
 from mipsjax.host.features import Features
 from mipsjax.policy import Status
 from mipsjax.schedule import Job
@@ -150,6 +151,8 @@ class SlamState(NamedTuple):
     """None before there are two trusted frames, and where a lost camera was found elsewhere."""
     refinement: Refinement | None = None
     """Under way."""
+    corners: tuple[Corners, ...] = ()
+    """Of the last trusted frame, then of the newest keyframes before it."""
     residual: float = 0.0
     """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
 

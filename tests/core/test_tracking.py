@@ -11,6 +11,8 @@ import jaxlie
 import numpy as np
 import pytest
 from corner import ADAM, CAMERA, CFG, HOME, WALLS, apart, pose, see, unprojected
+from planes import CFG as PLANE_CFG
+from planes import plane
 
 from mipsjax.core import field as nf
 from mipsjax.core import tracking
@@ -261,3 +263,47 @@ def test_the_robust_cost():
     cost = np.asarray(tracking.robust_cost(jnp.asarray(psi), 0.02))
     np.testing.assert_allclose(cost, 0.02**2 * np.log1p((psi / 0.02) ** 2), rtol=1e-5)
     assert (cost <= psi**2 + 1e-9).all() and (np.diff(cost[5:]) > 0).all()
+
+
+def landmarks_of(T_sub_cam, p_sub, noise=0.0) -> tracking.Landmarks:
+    """Where points of the submap are seen from a pose; those behind the camera are fillers."""
+    p_cam = np.asarray(transform(jnp.asarray(np.linalg.inv(T_sub_cam), jnp.float32), p_sub))
+    mask = p_cam[:, 2] > 0.1
+    ray = p_cam[:, :2] / np.where(mask, p_cam[:, 2], 1)[:, None]
+    ray = ray + noise * np.random.default_rng(0).normal(size=ray.shape)
+    return tracking.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), jnp.asarray(mask))
+
+
+def test_the_equations_of_landmarks_against_automatic_derivatives(points):
+    pixel = 1 / CAMERA.fx
+    p_sub = transform(jnp.asarray(TRUTH, jnp.float32), points.p_cam)
+    landmarks = landmarks_of(TRUTH, p_sub, noise=2 * pixel)
+    T = jnp.asarray(TRUTH @ pose((0.5, 0.3, -0.4), (0.01, -0.02, 0.01)), jnp.float32)
+
+    def cost(twist):
+        moved = T @ jaxlie.SE3.exp(twist).as_matrix()
+        return tracking.landmark_system(moved, landmarks, pixel, CFG).cost
+
+    found = jax.jit(lambda: tracking.landmark_system(T, landmarks, pixel, CFG))()
+    expected = jax.jit(jax.grad(cost))(jnp.zeros(6)) / 2
+    np.testing.assert_allclose(found.slope, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+    # Positive definite: points of three walls leave no direction free
+    assert np.linalg.eigvalsh(np.asarray(found.hessian))[0] > 0
+
+
+def test_landmarks_hold_what_surfaces_leave_free():
+    """In front of one wall the camera slides; points painted on it say where it is."""
+    wall = plane((0, 0, -1), -2.0, cfg=PLANE_CFG)
+    depth = np.full((CAMERA.height, CAMERA.width), 2, np.float32)
+    seen = tracking.draw_points(KEY, depth, np.zeros((*depth.shape, 3), np.uint8), 300, CAMERA)
+    landmarks = landmarks_of(np.eye(4), np.asarray(seen.p_cam))
+    start = jnp.asarray(pose((0, 0, 3), (0.03, -0.02, 0)), jnp.float32)
+
+    def end(landmarks):
+        return tracking.levenberg_marquardt(
+            wall, start, seen, "whole", 10, PLANE_CFG, landmarks=landmarks, pixel=1 / CAMERA.fx
+        )
+
+    without, held = apart(end(None), np.eye(4)), apart(end(landmarks), np.eye(4))
+    assert without[0] > 0.03 and without[1] > 2.5
+    assert held[0] < 0.002 and held[1] < 0.1  # exact input: what is left is float32 and the last step

@@ -37,6 +37,16 @@ class Points(NamedTuple):
     """False where there is no measurement."""
 
 
+class Landmarks(NamedTuple):
+    """N points of earlier frames that were found again in this one's image."""
+
+    p_sub: Float[Array, "N 3"]
+    ray: Float[Array, "N 2"]
+    """Where they are seen: image point at focal length 1."""
+    mask: Bool[Array, " N"]
+    """False fills up to a fixed number."""
+
+
 class Fit(NamedTuple):
     """How well a frame fits the map at a pose."""
 
@@ -115,13 +125,16 @@ def levenberg_marquardt(
     cfg: Config,
     views: Views | None = None,
     view_camera: Intrinsics | None = None,
+    landmarks: Landmarks | None = None,
+    pixel: float = 1.0,
 ) -> Float[Array, "4 4"]:
     """Robust second-order refinement of d2t: residual psi, analytic gradient, Cauchy weight, closed 6 x 6 system.
 
     Points weigh by the noise of their depth: what is near says more, also of the rotation.
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
-    the map is never an improvement. Depth images of keyframes are a second term where `views` are given.
+    the map is never an improvement. Depth images of keyframes are a second term where `views` are given, and corners
+    of the image a third where `landmarks` are; a `pixel` is so wide at focal length 1.
     """
     go, precision = cfg.track.go, precisions(points, cfg)
 
@@ -134,6 +147,9 @@ def levenberg_marquardt(
 
     def system(T):
         total = map_system(field, T, points, part, cfg)
+        if landmarks is not None:
+            seen = landmark_system(T, landmarks, pixel, cfg)
+            total = jax.tree.map(jnp.add, total, seen)
         if views is None or view_camera is None:
             return total
         errors = plane_errors(views, transform(T, points.p_cam), view_camera, VIEW_REACH)
@@ -171,6 +187,33 @@ def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf
     if go.uncertainty:
         weight *= losses.certainty(entropy, go.entropy_floor)
     return _system(psi, rows, weight, robust_cost(psi, scale) * precision)
+
+
+def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, pixel: float, cfg: Config) -> System:
+    """Normal equations of where landmarks are seen, for a twist (v, omega) in the camera's frame.
+
+    Errors in the image are scaled so that one standard deviation of a corner is one of a point's depth
+    (`sensor.noise_floor`), metres, and both weigh alike.
+    """
+    corners = cfg.track.corners
+    metres = cfg.sensor.noise_floor / (corners.noise_px * pixel)
+    p_cam = (landmarks.p_sub - T[None, :3, 3]) @ T[:3, :3]
+    in_front = p_cam[:, 2] > sampling.NEAR
+    z = jnp.where(in_front, p_cam[:, 2], 1.0)
+    aim = p_cam[:, :2] / z[:, None]
+    error = metres * (aim - landmarks.ray)
+    # T exp(xi) moves a point of the submap by -v - omega x p in the camera's frame
+    zero, one = jnp.zeros_like(z), jnp.ones_like(z)
+    gradient = jnp.stack(
+        [jnp.stack([one, zero, -aim[:, 0]], -1), jnp.stack([zero, one, -aim[:, 1]], -1)], axis=1
+    )
+    gradient *= (metres / z)[:, None, None]
+    rows = jnp.concatenate([-gradient, -jnp.cross(p_cam[:, None], gradient)], -1)
+    scale = corners.robust * cfg.sensor.noise_floor
+    squared = jnp.sum(error**2, -1)
+    weight = corners.weight * (landmarks.mask & in_front) / (1 + squared / scale**2)
+    cost = corners.weight * landmarks.mask * scale**2 * jnp.log1p(squared / scale**2)
+    return _system(error.reshape(-1), rows.reshape(-1, 6), jnp.repeat(weight, 2), cost)
 
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
@@ -241,11 +284,13 @@ def track(
     cfg: Config,
     views: Views | None = None,
     converged: Float[Array, ""] | None = None,
+    landmarks: Landmarks | None = None,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
 
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
-    field also align the frame to.
+    field also align the frame to. `landmarks` are corners of earlier frames, which these steps keep where the frame
+    shows them.
 
     The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
     field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
@@ -270,7 +315,9 @@ def track(
         if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
-            T = levenberg_marquardt(field, T, points, "whole", go.steps, cfg, views, view_camera)
+            T = levenberg_marquardt(
+                field, T, points, "whole", go.steps, cfg, views, view_camera, landmarks, 1 / camera.fx
+            )
         return T, measure_fit(field, T, points, "whole", cfg)
 
     def far(T):

@@ -78,7 +78,7 @@ def detect(
     every = coarse_stride(camera)
     coarse = depth[::every, ::every].copy()
     pixel, strength, extent, raw = _keypoints(color)
-    surface, z = _surface_depth(depth, pixel)
+    surface, z = surface_depth(depth, pixel)
     found = np.flatnonzero(surface)
     found = found[np.argsort(-strength[found], kind="stable")[:MAX_FEATURES]]
     found = found[np.argsort(-extent[found], kind="stable")]
@@ -157,7 +157,7 @@ def _keypoints(
     return (where + 0.5) * enlarge - 0.5, strength, extent, descriptors
 
 
-def _surface_depth(
+def surface_depth(
     depth: Float32[np.ndarray, "H W"], pixel: Float32[np.ndarray, "K 2"]
 ) -> tuple[Bool[np.ndarray, "K"], Float32[np.ndarray, "K"]]:
     """Whether the depths around each pixel belong to one surface, and their median."""

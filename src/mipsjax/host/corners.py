@@ -1,0 +1,161 @@
+"""Corners of the image, followed from frames whose pose is known (Lucas and Kanade 1981, on a pyramid).
+
+Where surfaces leave a direction free, as along a plain wall, the edge of a lamp or of a picture still holds the camera.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from mipsjax.core.camera import Intrinsics
+from mipsjax.host.features import surface_depth
+
+QUALITY = 0.001
+"""Least strength of a corner, relative to the strongest one of its image."""
+SPACING_PX = 5
+"""Least distance of two corners."""
+WINDOW_PX = 15
+"""Side of the square around a corner that is compared."""
+LEVELS = 3
+"""Of the pyramid above the image: flow of some 50 pixels beside what the guess explains."""
+RETURN_PX = 0.5
+"""A corner that is followed there and back again and ends farther off than this is not believed."""
+TEXTURE = 1e-4
+"""Least eigenvalue of a window's gradients, divided by its pixels, below which a corner is not followed."""
+HYPOTHESES = 200
+"""Of the motion by RANSAC: with half of the corners wrong, each set of four has a chance of 1 in 16."""
+MOTION_PX = 1.5
+"""Largest error of a corner that agrees with the motion."""
+NEAREST_M = 0.1
+"""Points nearer than this to the camera, or behind it, are not projected."""
+
+
+class Corners(NamedTuple):
+    """What can be followed from one frame: at most `count` corners on measured surfaces."""
+
+    record: int
+    """Place of the frame in `SlamState.records`."""
+    grey: UInt8[np.ndarray, "H W"]
+    pixel: Float32[np.ndarray, "N 2"]
+    p_cam: Float32[np.ndarray, "N 3"]
+    """Metres, in the frame's own camera."""
+
+
+class Followed(NamedTuple):
+    """Corners of an earlier frame that were found in the current one."""
+
+    p_ref: Float64[np.ndarray, "N 3"]
+    """Metres, in the camera of the earlier frame."""
+    pixel: Float64[np.ndarray, "N 2"]
+    """In the current image."""
+    T_ref_cam: Float64[np.ndarray, "4 4"]
+    """The motion that they agree on."""
+
+
+def grey_of(color: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
+    """Brightness of an RGB image."""
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def corners(
+    grey: UInt8[np.ndarray, "H W"],
+    depth: Float32[np.ndarray, "H W"],
+    record: int,
+    count: int,
+    camera: Intrinsics,
+) -> Corners:
+    """The strongest corners of a frame, where the depth around them is measured and belongs to one surface."""
+    found = cv2.goodFeaturesToTrack(grey, count, QUALITY, SPACING_PX)
+    pixel = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    surface, z = surface_depth(depth, pixel)
+    pixel, z = pixel[surface], z[surface]
+    x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
+    return Corners(record, grey, pixel, np.stack([x * z, y * z, z], 1).astype(np.float32))
+
+
+def follow(
+    reference: Corners,
+    grey: UInt8[np.ndarray, "H W"],
+    T_ref_cam: Float64[np.ndarray, "4 4"],
+    fewest: int,
+    camera: Intrinsics,
+) -> Followed | None:
+    """Corners of `reference` in the image `grey`, which was taken at about `T_ref_cam`.
+
+    None where fewer than `fewest` are found there and back again and agree on one motion.
+    """
+    guess, visible = _project(reference.p_cam, np.linalg.inv(T_ref_cam), camera)
+    pixel, p_ref = reference.pixel[visible], reference.p_cam[visible]
+    if len(pixel) < fewest:
+        return None
+    there, back = _there_and_back(reference.grey, grey, pixel, guess[visible])
+    p_ref, there = p_ref[back].astype(np.float64), there[back].astype(np.float64)
+    if len(there) < fewest:
+        return None
+    T, agreed = _motion(p_ref, there, camera)
+    if T is None or len(agreed) < fewest:
+        return None
+    return Followed(p_ref[agreed], there[agreed], T)
+
+
+def _project(
+    p_ref: Float32[np.ndarray, "N 3"], T_cam_ref: Float64[np.ndarray, "4 4"], camera: Intrinsics
+) -> tuple[Float32[np.ndarray, "N 2"], Bool[np.ndarray, "N"]]:
+    """Pixels of points of another camera, and which of them lie in the image."""
+    x, y, z = (p_ref @ T_cam_ref[:3, :3].T + T_cam_ref[None, :3, 3]).T
+    safe = np.maximum(z, NEAREST_M)
+    pixel = np.stack([camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy], 1)
+    inside = np.all((pixel >= 0) & (pixel <= (camera.width - 1, camera.height - 1)), axis=1)
+    return pixel.astype(np.float32), inside & (z > NEAREST_M)
+
+
+def _there_and_back(
+    before: UInt8[np.ndarray, "H W"],
+    now: UInt8[np.ndarray, "H W"],
+    pixel: Float32[np.ndarray, "N 2"],
+    guess: Float32[np.ndarray, "N 2"],
+) -> tuple[Float32[np.ndarray, "N 2"], Bool[np.ndarray, "N"]]:
+    """Where the corners are now, and which of them lead back to where they came from."""
+    how = {
+        "winSize": (WINDOW_PX, WINDOW_PX),
+        "maxLevel": LEVELS,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "minEigThreshold": TEXTURE,
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, now, pixel[:, None], guess[:, None].copy(), **how)
+    # Looked for as far off on the way back as on the way there: from the answer anything would lead back to it
+    start = there + (pixel - guess)[:, None]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, there, start, **how)
+    there, back = there.reshape(-1, 2), back.reshape(-1, 2)
+    returned = np.linalg.norm(back - pixel, axis=1) < RETURN_PX
+    inside = np.all((there >= 0) & (there <= np.array(now.shape[::-1]) - 1), axis=1)
+    return there, (found.ravel() > 0) & (again.ravel() > 0) & returned & inside
+
+
+def _motion(
+    p_ref: Float64[np.ndarray, "N 3"], pixel: Float64[np.ndarray, "N 2"], camera: Intrinsics
+) -> tuple[Float64[np.ndarray, "4 4"] | None, np.ndarray]:
+    """T_ref_cam by perspective of points, and the places of those that agree with it."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    cv2.setRNGSeed(0)
+    ok, turn, shift, inliers = cv2.solvePnPRansac(
+        p_ref,
+        pixel,
+        K,
+        None,
+        iterationsCount=HYPOTHESES,
+        reprojectionError=MOTION_PX,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not ok or inliers is None:
+        return None, np.zeros(0, int)
+    agreed = np.asarray(inliers, int).ravel()
+    if len(agreed) >= 4:
+        turn, shift = cv2.solvePnPRefineLM(p_ref[agreed], pixel[agreed], K, None, turn, shift)
+    T_cam_ref = np.eye(4)
+    T_cam_ref[:3, :3], T_cam_ref[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return np.linalg.inv(T_cam_ref), agreed

@@ -1,0 +1,78 @@
+"""Corners of earlier frames in the current one: where they say that the camera is, and what they add to tracking."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from mipsjax.config import Config
+from mipsjax.core.camera import Intrinsics
+from mipsjax.core.tracking import Landmarks
+from mipsjax.core.volume import moved
+from mipsjax.data.sequence import Frame
+from mipsjax.host.corners import Followed, corners, follow, grey_of
+from mipsjax.state import Pose, SlamState, inverse, pose_of
+
+
+class Seen(NamedTuple):
+    """Corners of one earlier frame that were found again."""
+
+    T_sub_ref: Pose
+    """Pose of that frame."""
+    followed: Followed
+
+    @property
+    def T_sub_cam(self) -> Pose:
+        """The current pose by these corners alone."""
+        return self.T_sub_ref @ self.followed.T_ref_cam
+
+
+def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> list[Seen]:
+    """Corners of the last trusted frame and of keyframes, as far as they are found; none without colour.
+
+    `expected` is the pose at which the first are looked for. The others are looked for where the ones before say.
+    """
+    if frame.color is None or not state.corners:
+        return []
+    grey, found = grey_of(frame.color), list[Seen]()
+    for reference in state.corners:
+        record = state.records[reference.record]
+        if record.submap != state.active:
+            continue
+        T_sub_ref = pose_of(state, record)
+        guess = inverse(T_sub_ref) @ expected
+        followed = follow(reference, grey, guess, cfg.track.corners.fewest, state.camera)
+        if followed is None:
+            continue
+        found.append(Seen(T_sub_ref, followed))
+        expected = found[-1].T_sub_cam
+    return found
+
+
+def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks | None:
+    """All of them, filled up to a fixed number; None where the configuration wants no corners."""
+    size = cfg.track.corners.count * (1 + cfg.track.corners.keyframes)
+    if not size:
+        return None
+    p_sub, ray, mask = np.zeros((size, 3), np.float32), np.zeros((size, 2), np.float32), np.zeros(size, bool)
+    begin = 0
+    for seen in found:
+        end = begin + len(seen.followed.pixel)
+        p_sub[begin:end] = moved(seen.T_sub_ref, seen.followed.p_ref)
+        ray[begin:end] = (seen.followed.pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        mask[begin:end] = True
+        begin = end
+    return Landmarks(jnp.asarray(p_sub), jnp.asarray(ray), jnp.asarray(mask))
+
+
+def with_corners(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
+    """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far."""
+    wanted = cfg.track.corners
+    if not wanted.count or frame.color is None or frame.depth is None:
+        return state
+    kept = [old for old in state.corners if state.records[old.record].info.keyframe][: wanted.keyframes]
+    last = len(state.records) - 1
+    newest = corners(grey_of(frame.color), frame.depth, last, wanted.count, state.camera)
+    return state._replace(corners=(newest, *kept))

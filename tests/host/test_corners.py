@@ -1,0 +1,83 @@
+"""Corners followed between frames: the motion they find, and the images in which there is nothing to follow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mipsjax.host.corners import Corners, corners, follow
+from painted import CAMERA, RANGE_M, painting, pose, wall
+
+COUNT, FEWEST = 400, 30
+MOTIONS = [
+    ((0, 0, 0), (0, 0, 0)),
+    ((0, 0, 0), (0.03, -0.02, 0.04)),
+    ((0, 0, 5), (0, 0, 0)),
+    ((3, -4, 2), (0.05, 0.03, -0.06)),
+]
+"""Degrees and metres."""
+
+
+def from_home(grey: np.ndarray, depth: np.ndarray) -> Corners:
+    return corners(grey, depth, 7, COUNT, CAMERA)
+
+
+def test_corners_lie_on_the_surface_that_was_measured():
+    found = from_home(*wall(np.eye(4), painting()))
+    assert 100 < len(found.pixel) <= COUNT and found.record == 7
+    np.testing.assert_allclose(found.p_cam[:, 2], RANGE_M, rtol=1e-5)
+    image = found.p_cam[:, :2] / found.p_cam[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
+    np.testing.assert_allclose(image, found.pixel, atol=1e-3)  # float32 at 320 pixels
+
+
+@pytest.mark.parametrize(("degrees", "metres"), MOTIONS)
+def test_the_motion_is_found_from_no_motion(degrees, metres):
+    painted, truth = painting(), pose(degrees, metres)
+    found = follow(from_home(*wall(np.eye(4), painted)), wall(truth, painted)[0], np.eye(4), FEWEST, CAMERA)
+    assert found is not None
+    T_error = np.linalg.inv(truth) @ found.T_ref_cam
+    # A tenth of a pixel is 0.7 mm and 0.02 degrees; a shift and a turn are hard to tell apart on one plane
+    assert np.linalg.norm(T_error[:3, 3]) < 0.005
+    assert np.degrees(Rotation.from_matrix(T_error[:3, :3]).magnitude()) < 0.15
+
+
+def test_a_fast_turn_is_found_from_a_guess_near_it():
+    """Twelve degrees are 60 pixels, which flow alone does not reach."""
+    painted, truth = painting(), pose((0, 12, 0), (0, 0, 0))
+    home, grey = from_home(*wall(np.eye(4), painted)), wall(truth, painted)[0]
+    found = follow(home, grey, pose((0, 10, 0), (0, 0, 0)), FEWEST, CAMERA)
+    assert found is not None
+    assert np.degrees(Rotation.from_matrix(truth[:3, :3].T @ found.T_ref_cam[:3, :3]).magnitude()) < 0.15
+
+
+def test_a_part_that_moves_by_itself_is_left_out():
+    painted = painting()
+    home, (grey, _) = from_home(*wall(np.eye(4), painted)), wall(np.eye(4), painted)
+    moved = grey.copy()
+    moved[60:180, 120:240] = grey[60:180, 112:232]
+    found = follow(home, moved, np.eye(4), FEWEST, CAMERA)
+    assert found is not None and np.abs(found.T_ref_cam - np.eye(4)).max() < 0.005
+    inside = np.all((found.pixel > (130, 65)) & (found.pixel < (230, 175)), axis=1)
+    assert not inside.any()
+
+
+@pytest.mark.parametrize("what", ["flat", "other place", "no depth"])
+def test_nothing_to_follow_is_none(what):
+    painted = painting()
+    grey, depth = wall(np.eye(4), painted)
+    if what == "flat":
+        grey = np.full_like(grey, 128)
+    elif what == "no depth":
+        depth = np.zeros_like(depth)
+    now = wall(np.eye(4), painting(1))[0] if what == "other place" else grey
+    assert follow(from_home(grey, depth), now, np.eye(4), FEWEST, CAMERA) is None
+
+
+def test_the_same_corners_twice():
+    painted = painting()
+    home, grey = from_home(*wall(np.eye(4), painted)), wall(pose((1, 2, 0), (0, 0, 0.05)), painted)[0]
+    one, two = (follow(home, grey, np.eye(4), FEWEST, CAMERA) for _ in range(2))
+    assert one is not None and two is not None
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)

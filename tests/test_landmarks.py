@@ -1,0 +1,101 @@
+"""Landmarks: which frames corners are followed from, where they say the camera is, and what tracking is given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mipsjax.config import Config, CornerConfig, TrackConfig
+from mipsjax.core import mapping
+from mipsjax.core.volume import Box
+from mipsjax.data.sequence import Frame
+from mipsjax.landmarks import follow_all, landmarks, with_corners
+from mipsjax.policy import Status
+from mipsjax.state import FrameInfo, Keyframe, Pose, Record, SlamState, Submap, distance
+from painted import CAMERA, painting, pose, wall
+
+CFG = Config()
+SIZE = CFG.track.corners.count * (1 + CFG.track.corners.keyframes)
+LEARNED = mapping.Learned(None, None)  # type: ignore[arg-type]  # nothing here reads a map
+BOX = Box(np.zeros(3), np.ones(3))
+PAINTED = painting()
+PATH = [pose((0, i, 0), (0.02 * i, 0, 0)) for i in range(6)]
+"""A degree and 2 cm a frame."""
+
+
+def frame(place: int, color: bool = True) -> Frame:
+    grey, depth = wall(PATH[place], PAINTED)
+    return Frame(place, place / 30, np.repeat(grey[..., None], 3, axis=2) if color else None, depth)
+
+
+def travelled(keyframes: tuple[int, ...], until: int, cfg: Config = CFG) -> SlamState:
+    """After frames 0 to `until` at true poses, in one submap whose anchor is the first."""
+    anchor = Keyframe(0, np.zeros((1, 1), np.float32), np.zeros((1, 1, 3), np.uint8), np.eye(4))
+    state = SlamState((Submap(LEARNED, BOX, (anchor,), np.eye(4)),), 0, (), CAMERA, 0)
+    for place in range(until + 1):
+        info = FrameInfo(keyframe=place in keyframes)
+        record = Record(place, place / 30, 0, 0, PATH[place], Status.OK, info)
+        state = with_corners(state._replace(records=(*state.records, record)), frame(place), cfg)
+    return state
+
+
+def test_the_last_frame_comes_first_then_the_newest_keyframes():
+    state = travelled((0, 1, 2), until=4)
+    assert [c.record for c in state.corners] == [4, 2, 1]
+    assert [c.record for c in travelled((0, 1, 4), until=4).corners] == [4, 1, 0]
+
+
+def test_each_frame_says_where_the_camera_is():
+    state = travelled((0, 2), until=4)
+    found = follow_all(state, frame(5), PATH[4], CFG)
+    assert len(found) == 3
+    for seen in found:
+        metres, radians = distance(PATH[5], seen.T_sub_cam)
+        assert metres < 0.005 and radians < 0.003  # as in tests/host/test_corners.py
+
+
+def test_frames_of_another_submap_say_nothing():
+    state = travelled((0,), until=2)
+    elsewhere = state._replace(submaps=state.submaps * 2, active=1)
+    assert follow_all(elsewhere, frame(3), PATH[2], CFG) == []
+
+
+def test_without_colour_or_corners_there_is_nothing_to_follow():
+    state = travelled((0,), until=2)
+    assert follow_all(state, frame(3, color=False), PATH[2], CFG) == []
+    assert with_corners(state, frame(2, color=False), CFG) is state
+    none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
+    assert travelled((0,), until=2, cfg=none).corners == ()
+    assert landmarks([], CAMERA, none) is None
+
+
+@pytest.mark.parametrize("keyframes", [0, 2])
+def test_tracking_is_given_points_of_the_submap_where_they_are_seen(keyframes: int):
+    cfg = replace(CFG, track=TrackConfig(corners=CornerConfig(keyframes=keyframes)))
+    found = follow_all(travelled((0, 2), until=4, cfg=cfg), frame(5), PATH[4], cfg)
+    given = landmarks(found, CAMERA, cfg)
+    assert given is not None and len(given.mask) == CFG.track.corners.count * (1 + keyframes)
+    count = sum(len(seen.followed.pixel) for seen in found)
+    assert np.sum(given.mask) == count > 100
+    p_cam = (np.asarray(given.p_sub)[:count] - PATH[5][:3, 3]) @ PATH[5][:3, :3]
+    off = p_cam[:, :2] / p_cam[:, 2:] - np.asarray(given.ray)[:count]
+    # Followed to a fraction of a pixel, in frames whose poses are true
+    assert np.median(np.abs(off)) * CAMERA.fx < 0.3
+
+
+def test_no_landmarks_have_the_same_shape():
+    given = landmarks([], CAMERA, CFG)
+    assert given is not None and given.p_sub.shape == (SIZE, 3) and not given.mask.any()
+
+
+def test_where_the_camera_is_does_not_depend_on_a_turned_submap():
+    """Points are in the frame of the submap, whatever that is."""
+    T: Pose = pose((10, -20, 30), (1, 2, 3))
+    state = travelled((0,), until=2)
+    turned = state.with_submap(0, keyframes=(state.submap.keyframes[0]._replace(T_sub_cam=T),))
+    (one, *_), (other, *_) = (
+        follow_all(s, frame(3), start @ PATH[2], CFG) for s, start in ((state, np.eye(4)), (turned, T))
+    )
+    np.testing.assert_allclose(other.T_sub_cam, T @ one.T_sub_cam, atol=1e-3)
