@@ -99,8 +99,9 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     if not decision.tells:
         frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
-    state = _moved_on(learned, state, float(info.after.residual)) if decision.tells else learned
-    state = with_corners(state, frame, cfg)
+    if decision.tells:
+        learned = with_corners(_moved_on(learned, state, float(info.after.residual)), frame, cfg)
+    state = learned
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
     return refine_inactive(state, cfg, executor)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int, UInt8
 
 from mipsjax.core.camera import Intrinsics
 from mipsjax.host.features import surface_depth
@@ -96,10 +96,11 @@ def follow(
     p_ref, there = p_ref[back].astype(np.float64), there[back].astype(np.float64)
     if len(there) < fewest:
         return None
-    T, agreed = _motion(p_ref, there, camera)
-    if T is None or len(agreed) < fewest:
+    motion = _motion(p_ref, there, fewest, camera)
+    if motion is None:
         return None
-    return Followed(p_ref[agreed], there[agreed], T)
+    T_ref_cam, agreed = motion
+    return Followed(p_ref[agreed], there[agreed], T_ref_cam)
 
 
 def _project(
@@ -137,11 +138,11 @@ def _there_and_back(
 
 
 def _motion(
-    p_ref: Float64[np.ndarray, "N 3"], pixel: Float64[np.ndarray, "N 2"], camera: Intrinsics
-) -> tuple[Float64[np.ndarray, "4 4"] | None, np.ndarray]:
-    """T_ref_cam by perspective of points, and the places of those that agree with it."""
+    p_ref: Float64[np.ndarray, "N 3"], pixel: Float64[np.ndarray, "N 2"], fewest: int, camera: Intrinsics
+) -> tuple[Float64[np.ndarray, "4 4"], Int[np.ndarray, "M"]] | None:
+    """T_ref_cam by perspective of points, and the places of the at least `fewest` that agree with it."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    cv2.setRNGSeed(0)
+    # Its draws are the same in each call
     ok, turn, shift, inliers = cv2.solvePnPRansac(
         p_ref,
         pixel,
@@ -151,11 +152,10 @@ def _motion(
         reprojectionError=MOTION_PX,
         flags=cv2.SOLVEPNP_AP3P,
     )
-    if not ok or inliers is None:
-        return None, np.zeros(0, int)
+    if not ok or inliers is None or len(inliers) < fewest:
+        return None
     agreed = np.asarray(inliers, int).ravel()
-    if len(agreed) >= 4:
-        turn, shift = cv2.solvePnPRefineLM(p_ref[agreed], pixel[agreed], K, None, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(p_ref[agreed], pixel[agreed], K, None, turn, shift)
     T_cam_ref = np.eye(4)
     T_cam_ref[:3, :3], T_cam_ref[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return np.linalg.inv(T_cam_ref), agreed
+    return (np.linalg.inv(T_cam_ref), agreed) if np.isfinite(T_cam_ref).all() else None
