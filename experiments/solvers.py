@@ -27,8 +27,8 @@ from common import show, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import field as nf
-from mipsjax.core import tracking
-from mipsjax.core.camera import transform
+from mipsjax.core import solvers, tracking
+from mipsjax.core.camera import Intrinsics, transform
 from mipsjax.data.open import open_sequence
 from mipsjax.state import distance
 
@@ -36,14 +36,16 @@ OFFSET_M, OFFSET_RAD = 0.05, np.radians(5)
 SMALLEST = 1e-12  # square metres, under the root of the robust cost
 
 
-def with_optimistix(field: nf.Field, T: jax.Array, points: tracking.Points, cfg: Config) -> jax.Array:
+def with_optimistix(
+    field: nf.Field, T: jax.Array, points: solvers.Points, camera: Intrinsics, cfg: Config
+) -> jax.Array:
     """The robust cost of `levenberg_marquardt` as a sum of squares, solved by the library."""
 
     def residuals(twist, _):
         moved = T @ jaxlie.SE3.exp(twist).as_matrix()
         psi = nf.tsdf(field, transform(moved, points.p_cam), cfg.field).psi
-        cost = tracking.robust_cost(psi, cfg.track.go.robust) + SMALLEST
-        return jnp.sqrt(tracking.precisions(points, cfg)) * jnp.sqrt(cost)
+        cost = solvers.robust_cost(psi, cfg.track.go.robust) + SMALLEST
+        return jnp.sqrt(solvers.precisions(points, cfg)) * jnp.sqrt(cost)
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
     found = optx.least_squares(
@@ -57,8 +59,11 @@ def with_optimistix(field: nf.Field, T: jax.Array, points: tracking.Points, cfg:
     return T @ jaxlie.SE3.exp(found.value).as_matrix()
 
 
-def with_ours(field: nf.Field, T: jax.Array, points: tracking.Points, cfg: Config) -> jax.Array:
-    return tracking.levenberg_marquardt(field, T, points, "whole", cfg.track.go.steps, cfg)
+def with_ours(
+    field: nf.Field, T: jax.Array, points: solvers.Points, camera: Intrinsics, cfg: Config
+) -> jax.Array:
+    evidence = solvers.Evidence(points)
+    return solvers.levenberg_marquardt(field, T, evidence, "whole", cfg.track.go.steps, camera, cfg)
 
 
 def measured(
@@ -106,7 +111,7 @@ def main() -> None:
         cases.append((submap.field, start, points))
         truth.append(poses[place])
     rows = [
-        measured(name, partial(solve, cfg=cfg), cases, truth)
+        measured(name, partial(solve, camera=sequence.intrinsics, cfg=cfg), cases, truth)
         for name, solve in (("closed 6 x 6, scan", with_ours), ("optimistix", with_optimistix))
     ]
     for row in rows:

@@ -305,6 +305,9 @@ class TrackConfig:
     ro: SearchConfig = SearchConfig()
     go: RefineConfig = RefineConfig()
     corners: CornerConfig = CornerConfig()
+    prior: float = 0.1
+    """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only
+    along a direction that nothing else holds, with `lm`."""
     rest: float = 0.9
     """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
     velocity; 1 takes whichever is less, 0 never rest. A camera that surfaces hardly hold fits almost alike at rest, and

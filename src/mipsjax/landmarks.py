@@ -9,7 +9,7 @@ import numpy as np
 
 from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
-from mipsjax.core.tracking import Landmarks
+from mipsjax.core.solvers import Landmarks
 from mipsjax.core.volume import moved
 from mipsjax.data.sequence import Frame
 from mipsjax.host.corners import Followed, corners, follow, grey_of

@@ -128,6 +128,7 @@ RANGES: dict[str, Range] = {
     "track.corners.noise_px": POSITIVE,
     "track.corners.robust": POSITIVE,
     "track.corners.weight": NOT_NEGATIVE,
+    "track.prior": POSITIVE,
     "track.rest": SHARE,
     "keyframe.error": POSITIVE,
     "keyframe.known": SHARE,

@@ -15,7 +15,7 @@ from planes import CFG as PLANE_CFG
 from planes import plane
 
 from mipsjax.core import field as nf
-from mipsjax.core import tracking
+from mipsjax.core import solvers, tracking
 from mipsjax.core.camera import transform
 
 KEY = jax.random.key(7)
@@ -39,7 +39,7 @@ def frame() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def points(frame) -> tracking.Points:
+def points(frame) -> solvers.Points:
     depth, color = frame
     return tracking.draw_points(KEY, depth, color, CFG.track.go.pixels, CAMERA)
 
@@ -48,11 +48,12 @@ def points(frame) -> tracking.Points:
 def lm(corner_map, points):
     """Levenberg-Marquardt alone, from a stack of starts."""
     one = partial(
-        tracking.levenberg_marquardt,
+        solvers.levenberg_marquardt,
         corner_map.field,
-        points=points,
+        seen=solvers.Evidence(points),
         part="whole",
         steps=CFG.track.go.steps,
+        camera=CAMERA,
         cfg=CFG,
     )
     run = jax.jit(jax.vmap(lambda T: one(T)))
@@ -99,18 +100,18 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
 
     @jax.jit
     def derivatives(twist):
-        precision = tracking.precisions(points, cfg)
+        precision = solvers.precisions(points, cfg)
         # A saturated point costs, but is not to pull
-        pulls = jnp.abs(psi(twist)) < tracking.SATURATED * CFG.field.truncation
+        pulls = jnp.abs(psi(twist)) < solvers.SATURATED * CFG.field.truncation
 
         def costs(xi):
-            return precision * tracking.robust_cost(psi(xi), cfg.track.go.robust)
+            return precision * solvers.robust_cost(psi(xi), cfg.track.go.robust)
 
         gradient = jax.grad(lambda xi: jnp.sum(pulls * costs(xi)))(twist)
         weight = precision * pulls / (1 + (psi(twist) / cfg.track.go.robust) ** 2)
         rows = jax.jacfwd(psi)(twist)
-        expected = tracking.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
-        return tracking.map_system(corner_map.field, T, points, part, cfg), expected
+        expected = solvers.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
+        return solvers.map_system(corner_map.field, T, points, part, cfg), expected
 
     for found, expected in zip(*derivatives(jnp.zeros(6)), strict=True):
         # Sums of 768 float32 numbers in another order, of which those of the slope partly cancel
@@ -119,16 +120,16 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
 
 def test_points_count_by_the_noise_of_their_depth():
     z = jnp.array([0.5, 1.0, 2.0, 4.0, 0.0])
-    points = tracking.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
-    found = np.asarray(tracking.precisions(points, CFG))
+    points = solvers.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
+    found = np.asarray(solvers.precisions(points, CFG))
     assert found[-1] == 0 and found[:4].mean() == pytest.approx(1)
     noise = CFG.sensor.noise_growth * np.asarray(z[:4]) ** 2
     variance = CFG.sensor.noise_floor**2 + noise**2
     np.testing.assert_allclose(found[:4] * variance, found[0] * variance[0], rtol=1e-5)
     even = replace(CFG, sensor=replace(CFG.sensor, noise_growth=0.0))
-    np.testing.assert_allclose(tracking.precisions(points, even), points.mask)
+    np.testing.assert_allclose(solvers.precisions(points, even), points.mask)
     nothing = points._replace(mask=jnp.zeros(5, bool))
-    np.testing.assert_array_equal(tracking.precisions(nothing, CFG), 0)
+    np.testing.assert_array_equal(solvers.precisions(nothing, CFG), 0)
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -200,7 +201,7 @@ def test_the_search_recovers_what_lm_alone_does_not(corner_map, frame, lm, offse
 def test_adam_converges_from_a_small_offset(corner_map, points):
     """The paper's optimiser on d2t and colour; with steps of 1 cm and 0.57 degrees it ends near the truth."""
     start = TRUTH @ pose((0.5, -0.5, 0.3), (0.01, -0.005, 0.01))
-    run = jax.jit(partial(tracking.adam, corner_map.field, points=points, key=KEY, cfg=ADAM))
+    run = jax.jit(partial(solvers.adam, corner_map.field, points=points, key=KEY, cfg=ADAM))
     T = np.asarray(run(start.astype(np.float32)))
     before, after = apart(start, TRUTH), apart(T, TRUTH)
     assert after[0] < 0.5 * before[0] and after[1] < 0.7 * before[1]
@@ -260,31 +261,30 @@ def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, fr
 
 def test_the_robust_cost():
     psi = np.linspace(-0.1, 0.1, 11)
-    cost = np.asarray(tracking.robust_cost(jnp.asarray(psi), 0.02))
+    cost = np.asarray(solvers.robust_cost(jnp.asarray(psi), 0.02))
     np.testing.assert_allclose(cost, 0.02**2 * np.log1p((psi / 0.02) ** 2), rtol=1e-5)
     assert (cost <= psi**2 + 1e-9).all() and (np.diff(cost[5:]) > 0).all()
 
 
-def landmarks_of(T_sub_cam, p_sub, noise=0.0) -> tracking.Landmarks:
+def landmarks_of(T_sub_cam, p_sub, noise=0.0) -> solvers.Landmarks:
     """Where points of the submap are seen from a pose; those behind the camera are fillers."""
     p_cam = np.asarray(transform(jnp.asarray(np.linalg.inv(T_sub_cam), jnp.float32), p_sub))
     mask = p_cam[:, 2] > 0.1
     ray = p_cam[:, :2] / np.where(mask, p_cam[:, 2], 1)[:, None]
     ray = ray + noise * np.random.default_rng(0).normal(size=ray.shape)
-    return tracking.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), jnp.asarray(mask))
+    return solvers.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), jnp.asarray(mask))
 
 
 def test_the_equations_of_landmarks_against_automatic_derivatives(points):
-    pixel = 1 / CAMERA.fx
     p_sub = transform(jnp.asarray(TRUTH, jnp.float32), points.p_cam)
-    landmarks = landmarks_of(TRUTH, p_sub, noise=2 * pixel)
+    landmarks = landmarks_of(TRUTH, p_sub, noise=2 / CAMERA.fx)
     T = jnp.asarray(TRUTH @ pose((0.5, 0.3, -0.4), (0.01, -0.02, 0.01)), jnp.float32)
 
     def cost(twist):
         moved = T @ jaxlie.SE3.exp(twist).as_matrix()
-        return tracking.landmark_system(moved, landmarks, pixel, CFG).cost
+        return solvers.landmark_system(moved, landmarks, CAMERA, CFG).cost
 
-    found = jax.jit(lambda: tracking.landmark_system(T, landmarks, pixel, CFG))()
+    found = jax.jit(lambda: solvers.landmark_system(T, landmarks, CAMERA, CFG))()
     expected = jax.jit(jax.grad(cost))(jnp.zeros(6)) / 2
     np.testing.assert_allclose(found.slope, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     # Positive definite: points of three walls leave no direction free
@@ -300,9 +300,8 @@ def test_landmarks_hold_what_surfaces_leave_free():
     start = jnp.asarray(pose((0, 0, 3), (0.03, -0.02, 0)), jnp.float32)
 
     def end(landmarks):
-        return tracking.levenberg_marquardt(
-            wall, start, seen, "whole", 10, PLANE_CFG, landmarks=landmarks, pixel=1 / CAMERA.fx
-        )
+        evidence = solvers.Evidence(seen, landmarks=landmarks)
+        return solvers.levenberg_marquardt(wall, start, evidence, "whole", 10, CAMERA, PLANE_CFG)
 
     without, held = apart(end(None), np.eye(4)), apart(end(landmarks), np.eye(4))
     assert without[0] > 0.03 and without[1] > 2.5

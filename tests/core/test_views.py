@@ -11,7 +11,7 @@ import pytest
 from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see, unprojected
 
 from mipsjax.core import field as nf
-from mipsjax.core import tracking
+from mipsjax.core import solvers, tracking
 from mipsjax.core.views import Views, plane_errors, planes_at
 
 KEY = jax.random.key(11)
@@ -82,8 +82,14 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
 
     @jax.jit
     def end(given):
-        return tracking.levenberg_marquardt(
-            field, jnp.asarray(start), points, "whole", cfg.track.go.steps, cfg, given, CAMERA
+        return solvers.levenberg_marquardt(
+            field,
+            jnp.asarray(start),
+            solvers.Evidence(points, given),
+            "whole",
+            cfg.track.go.steps,
+            CAMERA,
+            cfg,
         )
 
     metres, degrees = apart(np.asarray(end(views)), TRUTH)
@@ -94,9 +100,11 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
 
 def test_points_say_as_much_as_their_precision(views, monkeypatch):
     """To the map and to the views alike: without any, nothing moves the pose."""
-    monkeypatch.setattr(tracking, "precisions", lambda points, cfg: 0.0 * points.mask)
+    monkeypatch.setattr(solvers, "precisions", lambda points, cfg: 0.0 * points.mask)
     points = tracking.draw_points(KEY, *see(TRUTH), CFG.track.go.pixels, CAMERA)
     start = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.01, 0, 0)), jnp.float32)
     field, steps = nf.init(KEY, CFG.field), CFG.track.go.steps
-    end = tracking.levenberg_marquardt(field, start, points, "whole", steps, CFG, views, CAMERA)
+    end = solvers.levenberg_marquardt(
+        field, start, solvers.Evidence(points, views), "whole", steps, CAMERA, CFG
+    )
     np.testing.assert_array_equal(end, start)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Float32
 from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core.camera import transform
-from mipsjax.core.tracking import SATURATED
+from mipsjax.core.solvers import SATURATED
 
 
 class Surface(NamedTuple):
