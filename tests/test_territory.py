@@ -60,7 +60,7 @@ def lands(monkeypatch, *ends: np.ndarray, held: float = 1.0) -> list[np.ndarray]
     """Every frame fits. In turn registration ends here, then always at the last of these; returns where it began."""
     began = []
 
-    def register(field, depth, T, camera, cfg):
+    def register(field, depth, T, camera, cfg, views):
         began.append(np.asarray(T))
         return Registration(ends[min(len(began), len(ends)) - 1], np.ones(()), np.ones(()), np.float32(held))
 

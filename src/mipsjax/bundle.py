@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from jaxtyping import Float64
 from mipsjax.config import Config
 from mipsjax.core import mapping, volume
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.rest import awake
 from mipsjax.state import Keyframe, Pose, Submap, rigid
@@ -57,6 +60,14 @@ def unprojected(
         [(u * every - small.cx) / small.fx * z, (v * every - small.cy) / small.fy * z, z], axis=1
     )
     return volume.moved(keyframe.T_sub_cam, p_cam)
+
+
+def views_of(keyframes: Sequence[Keyframe]) -> Views:
+    """Their depth images where they are, of a fixed size for tracking."""
+    return Views(
+        jnp.asarray(np.array([k.depth for k in keyframes], np.float32)),
+        jnp.asarray(np.array([k.T_sub_cam for k in keyframes], np.float32).reshape(-1, 4, 4)),
+    )
 
 
 def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:

@@ -9,12 +9,11 @@ from __future__ import annotations
 from time import perf_counter
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mipsjax.background import refine_inactive, taken_over
-from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine
+from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine, views_of
 from mipsjax.closure import close, prepare
 from mipsjax.config import Config
 from mipsjax.core import tracking
@@ -179,11 +178,7 @@ def _views(state: SlamState, cfg: Config) -> Views:
         if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
     ] or [submap.keyframes[submap.newest]]
     chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
-    height, width = near[0].depth.shape
-    return Views(
-        jnp.asarray(np.array([k.depth for k in chosen], np.float32).reshape(-1, height, width)),
-        jnp.asarray(np.array([k.T_sub_cam for k in chosen], np.float32).reshape(-1, 4, 4)),
-    )
+    return views_of(chosen)
 
 
 def _learn(

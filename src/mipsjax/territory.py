@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine
+from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine, views_of
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
@@ -18,6 +19,7 @@ from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
 
 AGAIN = 3  # times at most that registration is repeated: from 9 cm off the third moves a frame by millimetres
+VIEWS = 8  # keyframes that say what a submap observed around a guess
 STILL = 0.01  # metres, or as many times 1 rad: registration that moves a frame by less has ended
 
 
@@ -127,10 +129,11 @@ def sight(
 def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrinsics, cfg: Config) -> Any:
     """On the host. Again from where it ended while that moves it: across a loop the guess may be decimetres off."""
     small, depth = mapping_camera(camera, cfg), jnp.asarray(keyframe.depth)
+    views = views_of(_nearest(submap.keyframes, guess))
 
     def register(T_sub_cam: Pose) -> Any:
         start = jnp.asarray(T_sub_cam, jnp.float32)
-        return jax.device_get(tracking.register(submap.learned.field, depth, start, small, cfg))
+        return jax.device_get(tracking.register(submap.learned.field, depth, start, small, cfg, views))
 
     found = register(guess)
     for _ in range(AGAIN):
@@ -138,6 +141,12 @@ def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrins
             break
         guess, found = found.T_sub_cam, register(found.T_sub_cam)
     return found
+
+
+def _nearest(keyframes: Sequence[Keyframe], T_sub_cam: Pose) -> list[Keyframe]:
+    """`VIEWS` of them, the nearest first and again where there are fewer."""
+    ordered = sorted(keyframes, key=lambda keyframe: sum(distance(keyframe.T_sub_cam, T_sub_cam)))
+    return [ordered[i % len(ordered)] for i in range(VIEWS)]
 
 
 def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:

@@ -16,6 +16,7 @@ from planes import plane
 
 from mipsjax.core import field as nf
 from mipsjax.core import solvers, tracking
+from mipsjax.core.views import Views
 from mipsjax.core.camera import transform
 
 KEY = jax.random.key(7)
@@ -247,9 +248,11 @@ def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, fr
     back = (np.abs(seen[..., 2] - WALLS[2]) < 1e-3) & (np.abs(seen - WALLS)[..., :2].min(-1) > 0.3)
     assert 0.1 < back.mean() < 0.9
 
+    views = Views(jnp.asarray(depth)[None], jnp.asarray(TRUTH, jnp.float32)[None])
+
     def register(depth):
         guess = jnp.asarray(TRUTH @ NEAR, jnp.float32)
-        return jax.device_get(tracking.register(corner_map.field, depth, guess, CAMERA, CFG))
+        return jax.device_get(tracking.register(corner_map.field, depth, guess, CAMERA, CFG, views))
 
     corner, wall = register(depth), register(np.where(back, depth, np.float32(0)))
     assert corner.overlap > 0.5 and corner.inliers > 0.95 and wall.inliers > 0.95
@@ -257,6 +260,19 @@ def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, fr
     assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
     # Along a wall the frame slides freely but for the waves of a field with cells of 5 cm, in a corner it does not
     assert corner.held > 10 * CFG.loop.held and wall.held < 0.2 * corner.held
+
+
+def test_what_no_keyframe_observed_does_not_count_in_registration(corner_map, frame):
+    """The submap's keyframe saw the left half; the right half of the frame shows a wall moved by what it made up."""
+    depth, _ = frame
+    left = np.arange(CAMERA.width)[None] < CAMERA.width / 2
+    views = Views(jnp.asarray(np.where(left, depth, 0))[None], jnp.asarray(TRUTH, jnp.float32)[None])
+    moved = np.where(left, depth, depth - np.float32(0.08))
+    guess = jnp.asarray(TRUTH @ NEAR, jnp.float32)
+    found = jax.device_get(tracking.register(corner_map.field, moved, guess, CAMERA, CFG, views))
+    metres, degrees = apart(TRUTH, found.T_sub_cam)
+    assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
+    assert 0.3 < found.overlap < 0.6 and found.inliers > 0.95
 
 
 def test_the_robust_cost():

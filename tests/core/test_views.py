@@ -12,7 +12,7 @@ from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see, unprojecte
 
 from mipsjax.core import field as nf
 from mipsjax.core import solvers, tracking
-from mipsjax.core.views import Views, plane_errors, planes_at
+from mipsjax.core.views import Views, observed, plane_errors, planes_at
 
 KEY = jax.random.key(11)
 REACH = 0.1
@@ -70,6 +70,19 @@ def test_what_is_not_seen_is_masked(views, on_walls):
     empty = views._replace(depth=np.zeros_like(views.depth))
     errors = plane_errors(empty, jnp.asarray(on_walls), CAMERA, REACH)
     assert not errors.mask.any() and jnp.all(jnp.isfinite(errors.normal))
+
+
+def test_a_point_is_observed_where_a_view_measured_and_not_behind_it():
+    depth = np.full((2, CAMERA.height, CAMERA.width), 2, np.float32)
+    depth[:, :, : CAMERA.width // 2] = 0
+    turned = pose((0, 180, 0), (0, 0, 0))
+    views = Views(jnp.asarray(depth), jnp.asarray(np.stack([np.eye(4), turned]), jnp.float32))
+    #          on it,         before it,  a little and far behind,       no depth,       out of view, behind the camera
+    points = [(0.1, 0, 2), (0.1, 0, 1), (0.1, 0, 2.2), (0.1, 0, 2.4), (-0.1, 0, 2), (9, 0, 1), (0.1, 0, -2)]
+    found = observed(views, jnp.asarray(points, jnp.float32), CAMERA, margin=0.3)
+    # The last is seen by the view that is turned, in its half without depth
+    np.testing.assert_array_equal(found, [True, True, True, False, False, False, False])
+    assert not observed(views._replace(depth=0 * views.depth), jnp.ones((3, 3)), CAMERA, 0.3).any()
 
 
 def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):

@@ -27,7 +27,9 @@ from mipsjax.core.solvers import (
     robust_cost,
     systems,
 )
-from mipsjax.core.views import Views
+from mipsjax.core.views import Views, observed
+
+BEHIND = 0.3  # metres behind what a keyframe saw, to which its surface may still be that of a frame not yet registered
 
 
 class Fit(NamedTuple):
@@ -206,7 +208,7 @@ class Registration(NamedTuple):
 
     T_sub_cam: Float[Array, "4 4"]
     overlap: Float[Array, ""]
-    """Share of measured pixels where the submap is certain of its distance."""
+    """Share of measured pixels that the submap's keyframes observed and where it is certain of its distance."""
     inliers: Float[Array, ""]
     """Share of those that are within `keyframe.error` of its surface."""
     held: Float[Array, ""]
@@ -222,19 +224,30 @@ def register(
     T: Float[Array, "4 4"],
     camera: Intrinsics,
     cfg: Config,
+    views: Views,
 ) -> Registration:
-    """Second-order steps from a guess `T`, and what speaks for where they end. `depth` is at mapping size."""
+    """Second-order steps from a guess `T`, and what speaks for where they end. `depth` is at mapping size, as that of
+    `views`, the submap's keyframes near the guess.
+
+    Only pixels that they observed count, at the guess: elsewhere the submap is certain of surfaces that it made up, as
+    behind a shelf, and a frame that sees past the shelf would be drawn along it.
+    """
     color = jnp.zeros((*depth.shape, 3), jnp.uint8)
-    points = draw_points(jax.random.key(0), depth, color, cfg.track.go.pixels, camera)
+    every = draw_points(jax.random.key(0), depth, color, cfg.track.go.pixels, camera)
+
+    def known(T):
+        return every.mask & observed(views, transform(T, every.p_cam), camera, BEHIND)
+
+    points = every._replace(mask=known(T))
     if cfg.field.encoding == "both":
         T = levenberg_marquardt(field, T, Evidence(points), "search", cfg.track.go.smooth_steps, camera, cfg)
-    T = levenberg_marquardt(field, T, Evidence(points), "whole", cfg.track.go.steps, camera, cfg)
+    T = levenberg_marquardt(field, T, Evidence(points, views), "whole", cfg.track.go.steps, camera, cfg)
     hessian = map_system(field, T, points, "whole", cfg).hessian
     held = jnp.linalg.eigvalsh(hessian)[0] / jnp.maximum(jnp.sum(points.mask), 1)
-    prediction = nf.tsdf(field, transform(T, points.p_cam), cfg.field)
-    certain = points.mask & nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)
+    prediction = nf.tsdf(field, transform(T, every.p_cam), cfg.field)
+    certain = known(T) & nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)
     near = (jnp.abs(prediction.psi) < cfg.keyframe.error).astype(jnp.float32)
-    overlap = losses.masked_mean(certain.astype(jnp.float32), points.mask)
+    overlap = losses.masked_mean(certain.astype(jnp.float32), every.mask)
     return Registration(T, overlap, losses.masked_mean(near, certain), held)
 
 

@@ -53,18 +53,48 @@ def plane_errors(views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, r
     """
 
     def one(depth, T_sub_cam):
-        R = T_sub_cam[:3, :3]
-        p_cam = (p_sub - T_sub_cam[None, :3, 3]) @ R
-        u, v = jnp.round(project(p_cam, camera)).T
-        height, width = depth.shape
-        seen = (p_cam[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        v, u = jnp.clip(v, 0, height - 1).astype(jnp.int32), jnp.clip(u, 0, width - 1).astype(jnp.int32)
-        planes = planes_at(depth, v, u, camera)
-        distance = jnp.sum((p_cam - planes.point) * planes.normal, -1)
-        mask = seen & planes.flat & (jnp.abs(distance) < reach)
-        return PlaneErrors(jnp.where(mask, distance, 0.0), planes.normal @ R.T, mask)
+        pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
+        planes = planes_at(depth, pixel.v, pixel.u, camera)
+        distance = jnp.sum((pixel.p_cam - planes.point) * planes.normal, -1)
+        mask = pixel.inside & planes.flat & (jnp.abs(distance) < reach)
+        return PlaneErrors(jnp.where(mask, distance, 0.0), planes.normal @ T_sub_cam[:3, :3].T, mask)
 
     return jax.vmap(one)(views.depth, views.T_sub_cam)
+
+
+def observed(
+    views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, margin: float
+) -> Bool[Array, " P"]:
+    """Which points lie where a view measured: not outside of all images, nor `margin` metres or more behind what they
+    saw. What a map says elsewhere was never learned. `camera` is that of the views."""
+
+    def one(depth, T_sub_cam):
+        pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
+        d = depth[pixel.v, pixel.u]
+        return pixel.inside & (d > 0) & (pixel.p_cam[:, 2] < d + margin)
+
+    return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
+
+
+class _Pixels(NamedTuple):
+    """Where P points fall in one image."""
+
+    p_cam: Float[Array, "P 3"]
+    v: Int[Array, " P"]
+    u: Int[Array, " P"]
+    """Within the image, whatever the point."""
+    inside: Bool[Array, " P"]
+
+
+def _pixels(
+    p_sub: Float[Array, "P 3"], T_sub_cam: Float[Array, "4 4"], size: tuple[int, int], camera: Intrinsics
+) -> _Pixels:
+    height, width = size
+    p_cam = (p_sub - T_sub_cam[None, :3, 3]) @ T_sub_cam[:3, :3]
+    u, v = jnp.round(project(p_cam, camera)).T
+    inside = (p_cam[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    v, u = jnp.clip(v, 0, height - 1).astype(jnp.int32), jnp.clip(u, 0, width - 1).astype(jnp.int32)
+    return _Pixels(p_cam, v, u, inside)
 
 
 def planes_at(
