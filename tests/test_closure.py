@@ -13,6 +13,7 @@ from maps import keyframe, pose, state, submap
 from mipsjax import closure
 from mipsjax.closure import solve, without_rejected
 from mipsjax.core import mapping
+from mipsjax.host.features import Features
 from mipsjax.outputs import loops_content
 from mipsjax.presets import PRESETS
 from mipsjax.state import Loop, SlamState, distance
@@ -230,6 +231,30 @@ def arrived(given: SlamState) -> SlamState:
     records = [hung._replace(frame=2 * n, timestamp=n / 10) for n in range(101)]
     records[-1] = records[-1]._replace(keyframe=len(keyframes) - 1)
     return given.with_submap(given.active, keyframes=keyframes)._replace(records=tuple(records))
+
+
+def test_after_the_last_frame_all_keyframes_are_looked_up_once_more(chain, monkeypatch):
+    """A loop that nobody saw while the camera moved is closed then, by a few keyframes and not by all."""
+    given, truth = chain
+    given = arrived(given)
+    *before, last = given.submap.keyframes
+    none = Features(np.zeros((0, 64), np.uint8), np.zeros((0, 3), np.float32), np.zeros((1, 1), np.float32))
+    seen = [last._replace(number=n, features=none) for n in range(90, 101)]
+    given = given.with_submap(given.active, keyframes=(*before, *seen))
+    asked = []
+
+    def recognise(state, keyframe, places, cfg):
+        asked.append(places)
+        return Sighting(0, truth[-1] @ T_LAST_CAM, 0.9) if 0 in places else None
+
+    monkeypatch.setattr(closure, "recognise", recognise)
+    after = closure.closed_again(given, CFG)
+    assert off(after, truth) < 0.1 * off(given, truth)
+    assert [(loop.frame, loop.first, loop.second, loop.how) for loop in after.loops] == [
+        (number, COUNT - 1, 0, "features") for number in (90, 91, 92)
+    ]
+    assert all(loop.weight == 1 for loop in after.loops)
+    assert 0 not in asked[-1] and COUNT - 2 not in asked[0], "neighbours are no loops"
 
 
 def test_neighbours_along_the_chain_are_never_rejected(ring):

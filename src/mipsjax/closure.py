@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mipsjax import surfaces
@@ -15,6 +17,7 @@ from mipsjax.state import How, Keyframe, Loop, Pose, SlamState, distance, last_p
 from mipsjax.surfaces import pair_of, plane_factor, pose_factor
 from mipsjax.territory import Expected, Sighting, link, sight
 
+LOOKED_UP = 3  # keyframes after the last frame that may join a pair of submaps
 DEVIATIONS = 3.0  # standard deviations of a pose from features by which the field may correct it
 
 
@@ -77,36 +80,79 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
     loops: list[tuple[Sighting, How]] = [pair for pair in found if pair[0].submap in new]
     if not loops and all(_agrees(state, sighting.submap, cfg) for sighting, _ in found):
         return state
+    return _closed(state, [Found(keyframe.number, active, *pair) for pair in loops], cfg)
+
+
+class Found(NamedTuple):
+    """A keyframe of one submap that another one, far away along the chain, has seen."""
+
+    number: int
+    """Of the keyframe."""
+    first: int
+    """The submap that it was tracked in."""
+    sighting: Sighting
+    how: How
+
+
+def _closed(state: SlamState, loops: list[Found], cfg: Config) -> SlamState:
+    """The pose graph solved with loops that were found, already linked, and these written down as judged by it."""
     solved, weights = solve(state, cfg)
     if not weights:  # nothing was judged: what was found is forgotten, and may be found again
-        for sighting, _ in loops:
-            state = unlinked(state, sighting.submap, keyframe.number)
+        for loop in loops:
+            state = unlinked(state, loop.sighting.submap, loop.number)
         return state
     moved = distance(_world(state), _world(solved))
     made = tuple(
         Loop(
-            frame=keyframe.number,
-            first=active,
-            second=sighting.submap,
-            how=how,
-            inliers=sighting.inliers,
+            frame=loop.number,
+            first=loop.first,
+            second=loop.sighting.submap,
+            how=loop.how,
+            inliers=loop.sighting.inliers,
             correction_m=moved[0],
             correction_rad=moved[1],
-            weight=weights[_pair(active, sighting.submap)],
+            weight=weights[_pair(loop.first, loop.sighting.submap)],
         )
-        for sighting, how in loops
+        for loop in loops
     )
     judged = _judged(solved, weights)
     return judged._replace(loops=(*judged.loops, *made))
 
 
 def closed_again(state: SlamState, cfg: Config) -> SlamState:
-    """After the last frame: the pose graph by all links and by finished surfaces, if it says more than which submap was
-    begun from which."""
-    begun = {(submap.parent, place) for place, submap in enumerate(state.submaps)}
-    if not cfg.loop.enabled or begun.issuperset(linked_pairs(state)):
+    """After the last frame: all keyframes are looked up once more, and the pose graph is solved by all links and by
+    finished surfaces, if it says more than which submap was begun from which."""
+    if not cfg.loop.enabled:
         return state
-    return _judged(*solve(state, cfg))
+    state, found = _looked_up(state, cfg) if cfg.loop.features else (state, [])
+    begun = {(submap.parent, place) for place, submap in enumerate(state.submaps)}
+    if begun.issuperset(linked_pairs(state)):
+        return state
+    return _closed(state, found, cfg)
+
+
+def _looked_up(state: SlamState, cfg: Config) -> tuple[SlamState, list[Found]]:
+    """All keyframes, by their images, in submaps far away that theirs is not linked with yet.
+
+    What they were looked for in while the camera moved had fewer keyframes then, and had learned less. Of a pair of
+    submaps only the first few are linked: they say how the two lie.
+    """
+    linked, found = set(linked_pairs(state)), list[Found]()
+    for active, submap in enumerate(state.submaps):
+        far = [p for p, n in enumerate(chain_distances(state, active)) if n >= cfg.loop.apart]
+        own = [
+            k for k in submap.keyframes if k.features is not None and state.records[k.number].submap == active
+        ]
+        for keyframe in own:
+            known = [_pair(loop.first, loop.sighting.submap) for loop in found]
+            places = [
+                p for p in far if _pair(active, p) not in linked and known.count(_pair(active, p)) < LOOKED_UP
+            ]
+            sighting = recognise(state, keyframe, places, cfg)
+            if sighting is not None:
+                state = link(state, keyframe, sighting)
+                found.append(Found(keyframe.number, active, sighting, "features"))
+    return state, found
 
 
 def _judged(state: SlamState, weights: dict[tuple[int, int], float]) -> SlamState:
