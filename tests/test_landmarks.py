@@ -37,14 +37,27 @@ def travelled(keyframes: tuple[int, ...], until: int, cfg: Config = CFG) -> Slam
     for place in range(until + 1):
         info = FrameInfo(keyframe=place in keyframes)
         record = Record(place, place / 30, 0, 0, PATH[place], Status.OK, info)
-        state = with_corners(state._replace(records=(*state.records, record)), frame(place), cfg)
+        found = follow_all(state, frame(place), PATH[max(place - 1, 0)], cfg)
+        state = with_corners(state._replace(records=(*state.records, record)), frame(place), found, cfg)
     return state
 
 
-def test_the_last_frame_comes_first_then_the_newest_keyframes():
-    state = travelled((0, 1, 2), until=4)
-    assert [c.record for c in state.corners] == [4, 2, 1]
-    assert [c.record for c in travelled((0, 1, 4), until=4).corners] == [4, 1, 0]
+def test_the_last_frame_comes_first_then_the_newest_keyframe_and_the_oldest_ones():
+    two = replace(CFG, track=TrackConfig(corners=CornerConfig(keyframes=2)))
+    assert [c.record for c in travelled((0, 1, 2), until=4, cfg=two).corners] == [4, 2, 0]
+    assert [c.record for c in travelled((0, 1, 4), until=4, cfg=two).corners] == [4, 1, 0]
+    assert [c.record for c in travelled((0, 1, 2), until=4).corners] == [4, 2, 1, 0]
+
+
+def test_a_keyframe_that_is_out_of_sight_is_let_go():
+    """Not where nothing at all is seen, as in a blurred frame."""
+    state = travelled((0, 1), until=3)
+    found = follow_all(state, frame(4), PATH[3], CFG)
+    assert [seen.reference.record for seen in found] == [3, 1, 0]
+    record = state.records[-1]._replace(T_keyframe_cam=PATH[4])
+    later = state._replace(records=(*state.records, record))
+    assert [c.record for c in with_corners(later, frame(4), found[:2], CFG).corners] == [4, 1]
+    assert [c.record for c in with_corners(later, frame(4), [], CFG).corners] == [4, 1, 0]
 
 
 def test_each_frame_says_where_the_camera_is():
@@ -56,16 +69,22 @@ def test_each_frame_says_where_the_camera_is():
         assert metres < 0.005 and radians < 0.003  # as in tests/host/test_corners.py
 
 
-def test_frames_of_another_submap_say_nothing():
-    state = travelled((0,), until=2)
-    elsewhere = state._replace(submaps=state.submaps * 2, active=1)
-    assert follow_all(elsewhere, frame(3), PATH[2], CFG) == []
+def test_frames_of_another_submap_say_nothing_unless_one_was_begun_from_the_other():
+    state, T_old_new = travelled((0,), until=2), pose((0, 40, 0), (1, 0, 2))
+    new = state.submap._replace(T_world_sub=state.submap.T_world_sub @ T_old_new)
+    expected = np.linalg.inv(T_old_new) @ PATH[2]
+    for parent, count in ((None, 0), (0, 2)):
+        elsewhere = state._replace(submaps=(state.submap, new._replace(parent=parent)), active=1)
+        found = follow_all(elsewhere, frame(3), expected, CFG)
+        assert len(found) == count
+        for seen in found:
+            assert distance(np.linalg.inv(T_old_new) @ PATH[3], seen.T_sub_cam)[0] < 0.005
 
 
 def test_without_colour_or_corners_there_is_nothing_to_follow():
     state = travelled((0,), until=2)
     assert follow_all(state, frame(3, color=False), PATH[2], CFG) == []
-    assert with_corners(state, frame(2, color=False), CFG) is state
+    assert with_corners(state, frame(2, color=False), [], CFG) is state
     none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
     assert travelled((0,), until=2, cfg=none).corners == ()
     assert landmarks([], CAMERA, none) is None

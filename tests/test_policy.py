@@ -22,6 +22,7 @@ PLAIN = FrameStats(
     measured=0.9,
     known=0.9,
     confirmed=0.8,
+    open=0.002,
     residual=0.01,
     least_residual=0.008,
     unsure=False,

@@ -15,7 +15,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.rest import awake
-from mipsjax.state import Keyframe, Pose, Submap, rigid
+from mipsjax.state import Keyframe, Pose, Submap, distance, rigid
 
 # Purposes of random draws: a draw added in one place moves no other.
 INIT, TRACK, MAP, CHOOSE, FINISH, BACKGROUND, MATCH = range(7)
@@ -68,6 +68,12 @@ def views_of(keyframes: Sequence[Keyframe]) -> Views:
         jnp.asarray(np.array([k.depth for k in keyframes], np.float32)),
         jnp.asarray(np.array([k.T_sub_cam for k in keyframes], np.float32).reshape(-1, 4, 4)),
     )
+
+
+def nearest(keyframes: Sequence[Keyframe], T_sub_cam: Pose, count: int) -> list[Keyframe]:
+    """So many of them, the nearest first, 1 rad as far as 1 m; where there are fewer, again from the first."""
+    ordered = sorted(keyframes, key=lambda keyframe: sum(distance(keyframe.T_sub_cam, T_sub_cam)))
+    return [ordered[i % len(ordered)] for i in range(count)]
 
 
 def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:

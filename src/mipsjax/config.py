@@ -248,6 +248,9 @@ class RefineConfig:
     """Metres from the last pose within which such keyframes lie."""
     view_rotation: float = 0.5
     """Radians, the same."""
+    known: int = 8
+    """Keyframes nearest to the expected pose: the steps trust the field only where these observed something, since
+    elsewhere it is certain of surfaces that it made up. 0: everywhere, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -286,8 +289,8 @@ class CornerConfig:
 
     count: int = 400
     """Followed from each earlier frame; 0 is none."""
-    keyframes: int = 2
-    """The newest ones, from which corners are followed beside the last frame."""
+    keyframes: int = 3
+    """From which corners are followed beside the last frame: the newest one, and the oldest that are still seen."""
     fewest: int = 12
     """Corners of one frame that must agree on a motion; fewer are not used."""
     noise_px: float = 0.7
@@ -299,12 +302,27 @@ class CornerConfig:
 
 
 @dataclass(frozen=True)
+class HeldConfig:
+    """What is said of how far a pose may be off."""
+
+    group: float = 16.0
+    """Points, and corners, that err together: neighbours share the error of one surface, or of one edge."""
+    acceleration: float = 3.0
+    """m/s^2, standard deviation of a camera's, where nothing else says how it moves."""
+    turn: float = 6.0
+    """rad/s^2, the same."""
+    weak: float = 0.04
+    """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation."""
+
+
+@dataclass(frozen=True)
 class TrackConfig:
     """RO, then GO."""
 
     ro: SearchConfig = SearchConfig()
     go: RefineConfig = RefineConfig()
     corners: CornerConfig = CornerConfig()
+    held: HeldConfig = HeldConfig()
     prior: float = 0.1
     """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only
     along a direction that nothing else holds, with `lm`."""

@@ -12,13 +12,14 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.solvers import Landmarks
 from mipsjax.core.volume import moved
 from mipsjax.data.sequence import Frame
-from mipsjax.host.corners import Followed, corners, follow, grey_of
+from mipsjax.host.corners import Corners, Followed, corners, follow, grey_of
 from mipsjax.state import Pose, SlamState, inverse, pose_of
 
 
 class Seen(NamedTuple):
     """Corners of one earlier frame that were found again."""
 
+    reference: Corners
     T_sub_ref: Pose
     """Pose of that frame."""
     followed: Followed
@@ -38,17 +39,31 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
         return []
     grey, found = grey_of(frame.color), list[Seen]()
     for reference in state.corners:
-        record = state.records[reference.record]
-        if record.submap != state.active:
+        T_sub_ref = _pose(state, reference)
+        if T_sub_ref is None:
             continue
-        T_sub_ref = pose_of(state, record)
         guess = inverse(T_sub_ref) @ expected
         followed = follow(reference, grey, guess, cfg.track.corners.fewest, state.camera)
         if followed is None:
             continue
-        found.append(Seen(T_sub_ref, followed))
+        found.append(Seen(reference, T_sub_ref, followed))
         expected = found[-1].T_sub_cam
     return found
+
+
+def _pose(state: SlamState, reference: Corners) -> Pose | None:
+    """Of an earlier frame in the active submap; None where it is not known to a hair.
+
+    It is in a submap, and in the one that was begun from it or that it was begun from: tracking went from one into the
+    other. How others lie is known only as well as loops say.
+    """
+    record, active = state.records[reference.record], state.active
+    if record.submap == active:
+        return pose_of(state, record)
+    other = state.submaps[record.submap]
+    if state.submap.parent != record.submap and other.parent != active:
+        return None
+    return inverse(state.submap.T_world_sub) @ other.T_world_sub @ pose_of(state, record)
 
 
 def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks | None:
@@ -56,23 +71,36 @@ def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks |
     size = cfg.track.corners.count * (1 + cfg.track.corners.keyframes)
     if not size:
         return None
-    p_sub, ray, mask = np.zeros((size, 3), np.float32), np.zeros((size, 2), np.float32), np.zeros(size, bool)
+    p_sub, ray = np.zeros((size, 3), np.float32), np.zeros((size, 2), np.float32)
+    axes, mask = np.zeros((size, 2, 2), np.float32), np.zeros(size, bool)
     begin = 0
     for seen in found:
         end = begin + len(seen.followed.pixel)
         p_sub[begin:end] = moved(seen.T_sub_ref, seen.followed.p_ref)
         ray[begin:end] = (seen.followed.pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        axes[begin:end] = seen.followed.axes
         mask[begin:end] = True
         begin = end
-    return Landmarks(jnp.asarray(p_sub), jnp.asarray(ray), jnp.asarray(mask))
+    return Landmarks(*(jnp.asarray(part) for part in (p_sub, ray, axes, mask)))
 
 
-def with_corners(state: SlamState, frame: Frame, cfg: Config) -> SlamState:
-    """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far."""
+def with_corners(state: SlamState, frame: Frame, found: list[Seen], cfg: Config) -> SlamState:
+    """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far.
+
+    `found` are those that the frame showed. The newest keyframe is kept, and of the others the oldest, as long as they
+    are seen: the longer a corner is followed, the less the camera drifts.
+    """
     wanted = cfg.track.corners
     if not wanted.count or frame.color is None or frame.depth is None:
         return state
-    kept = [old for old in state.corners if state.records[old.record].info.keyframe][: wanted.keyframes]
+    seen = {one.reference.record for one in found}
+    kept = [
+        old
+        for old in state.corners
+        if state.records[old.record].info.keyframe and (not seen or old.record in seen)
+    ]
+    if len(kept) > wanted.keyframes:
+        kept = kept[: min(1, wanted.keyframes)] + kept[len(kept) - wanted.keyframes + 1 :]
     last = len(state.records) - 1
     newest = corners(grey_of(frame.color), frame.depth, last, wanted.count, state.camera)
     return state._replace(corners=(newest, *kept))

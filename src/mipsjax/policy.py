@@ -32,6 +32,8 @@ class FrameStats(NamedTuple):
     """Share of measured pixels within KeyframeConfig.error of the mapped surface, 0..1."""
     confirmed: float
     """The same where the map is certain."""
+    open: float
+    """Standard deviation, metres or rad, along the direction that measurements hold least."""
     residual: float
     """Metres."""
     least_residual: float
@@ -118,7 +120,8 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
-    return Status.WEAK if stats.known < guard.weak or _is_sparse(stats, cfg) else Status.OK
+    loose = stats.open > cfg.track.held.weak
+    return Status.WEAK if stats.known < guard.weak or loose or _is_sparse(stats, cfg) else Status.OK
 
 
 def _allowed(stats: FrameStats, cfg: Config) -> float:

@@ -49,7 +49,9 @@ PAPER = Config(
     ),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
-        go=RefineConfig(method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0),
+        go=RefineConfig(
+            method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0, known=0
+        ),
         corners=CornerConfig(count=0),
     ),
     guard=UNGUARDED,

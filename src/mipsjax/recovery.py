@@ -9,9 +9,10 @@ import numpy as np
 
 from mipsjax.closure import recognise
 from mipsjax.config import Config
+from mipsjax.host.held import NONE, Matrix
 from mipsjax.policy import Status
 from mipsjax.state import Keyframe, Pose, SlamState, distance, world_pose
-from mipsjax.territory import activated, begin
+from mipsjax.territory import activated, begin, registered
 
 
 class Place(NamedTuple):
@@ -22,6 +23,8 @@ class Place(NamedTuple):
     keyframe: int
     """The nearest of its keyframes."""
     T_sub_cam: Pose
+    covariance: Matrix
+    """Of this pose."""
 
 
 def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | None:
@@ -31,7 +34,8 @@ def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | Non
         return None
     known = state.submaps[found.submap].keyframes
     nearest = min(range(len(known)), key=lambda i: sum(distance(known[i].T_sub_cam, found.T_sub_cam)))
-    return Place(activated(state, found.submap), nearest, found.T_sub_cam)
+    covariance = registered(known[nearest], found.T_sub_cam, cfg)
+    return Place(activated(state, found.submap), nearest, found.T_sub_cam, covariance)
 
 
 def lost_in_a_row(state: SlamState) -> int:
@@ -45,4 +49,4 @@ def start_anew(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place:
     last_seen = world_pose(state, state.records[-1])
     submap, _ = begin(keyframe, [], last_seen, cfg.map.submap_steps, state.camera, cfg)
     state = state._replace(submaps=(*state.submaps, submap))
-    return Place(activated(state, len(state.submaps) - 1), 0, np.eye(4))
+    return Place(activated(state, len(state.submaps) - 1), 0, np.eye(4), NONE)

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 from time import perf_counter
 
-import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mipsjax.background import refine_inactive, taken_over
-from mipsjax.bundle import CHOOSE, MAP, TRACK, choose, make_keyframe, random_key, refine, views_of
+from mipsjax.bundle import CHOOSE, MAP, choose, make_keyframe, random_key, refine
 from mipsjax.closure import close, prepare
 from mipsjax.config import Config
-from mipsjax.core import tracking
 from mipsjax.core.camera import Intrinsics
-from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.landmarks import follow_all, landmarks, with_corners
-from mipsjax.policy import STAY, Decision, FrameStats, Status, converged, decide, widening
+from mipsjax.host.held import NONE, Held, deviations
+from mipsjax.landmarks import with_corners
+from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import (
@@ -36,15 +33,13 @@ from mipsjax.state import (
     inverse,
     last_pose,
     pose_of,
-    rigid,
     thumbnail,
 )
 from mipsjax.territory import begin, enter, govern, settle
+from mipsjax.tracker import Tracked, coasting, last_trusted, track
 
 ANCHOR_MEASURED = 0.1
 """Share of pixels with depth that the first frame of a map needs."""
-DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
-DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 RESIDUAL_RISE = 0.02  # share of a frame's excess by which the least residual of late goes up
 
 
@@ -61,7 +56,7 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
         keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
     )
     record = Record(frame.number, frame.timestamp, 0, 0, np.eye(4), Status.OK, info)
-    state = with_corners(SlamState((submap,), 0, (record,), camera, 0), frame.cleaned(), cfg)
+    state = with_corners(SlamState((submap,), 0, (record,), camera, 0), frame.cleaned(), [], cfg)
     prepare(state, cfg)
     return state
 
@@ -87,19 +82,17 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     frame = frame.cleaned()
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
-    began = perf_counter()
-    T_sub_cam, info = _track(state, frame, cfg)
-    track_ms = _ms(began)
-    stats = _stats(state, frame.depth, T_sub_cam, info)
+    tracked = track(state, frame, cfg)
+    stats = _stats(state, frame.depth, tracked)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}, residual {1e3 * stats.residual:.0f} mm"
-        return _recover(taken_over(state, executor), frame, note, info, track_ms, cfg)
+        return _recover(taken_over(state, executor), frame, note, tracked, cfg)
     if not decision.tells:
         frame = frame._replace(problem=_few(stats.measured))
-    learned = _learn(state, frame, T_sub_cam, decision, info, track_ms, cfg)
+    learned = _learn(state, frame, tracked, decision, cfg)
     if decision.tells:
-        learned = with_corners(_moved_on(learned, state, float(info.after.residual)), frame, cfg)
+        learned = with_corners(_moved_on(learned, state, stats.residual), frame, tracked.found, cfg)
     state = learned
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
@@ -120,9 +113,7 @@ def _order(state: SlamState, cfg: Config, executor: Executor) -> SlamState:
     return state._replace(records=(*state.records[:-1], last._replace(info=info)))
 
 
-def _recover(
-    state: SlamState, frame: Frame, note: str, info: tracking.TrackInfo, track_ms: float, cfg: Config
-) -> SlamState:
+def _recover(state: SlamState, frame: Frame, note: str, tracked: Tracked, cfg: Config) -> SlamState:
     """A lost frame: looked for in the whole map, after a while the anchor of a new submap, otherwise set aside."""
     assert frame.depth is not None
     place, found = None, ""
@@ -134,70 +125,30 @@ def _recover(
         elif lost_in_a_row(state) >= cfg.loop.patience and not anchor_problem(frame):
             place, found = start_anew(state, keyframe, cfg), "nowhere"
     if place is None:
-        return _coast(state, frame, note, Status.LOST, cfg, info, track_ms)
-    details = _info(info, track_ms)._replace(
-        found=found, submap=place.state.active, keyframe=found == "nowhere"
-    )
+        return _coast(state, frame, note, Status.LOST, cfg, tracked)
+    details = _info(tracked)._replace(found=found, submap=place.state.active, keyframe=found == "nowhere")
     record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
-    record = record._replace(depth=thumbnail(frame.depth, state.camera))
+    held = Held(place.covariance, NONE)
+    record = record._replace(held=held, depth=thumbnail(frame.depth, state.camera))
     return place.state._replace(records=(*state.records, record), trouble=1, motion=None)
-
-
-def _track(state: SlamState, frame: Frame, cfg: Config) -> tuple[Pose, tracking.TrackInfo]:
-    assert frame.depth is not None
-    color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
-    candidates = _candidates(state, frame.timestamp)
-    found = follow_all(state, frame, candidates[0], cfg)
-    if found:
-        # What was measured between two images is a better guess than that the camera has gone on as before
-        candidates = [found[0].T_sub_cam, candidates[0]]
-    T, info = tracking.track(
-        state.submap.learned.field,
-        frame.depth,
-        color,
-        np.stack(candidates).astype(np.float32),
-        np.float32(widening(state.trouble, cfg)),
-        random_key(cfg, TRACK, len(state.records)),
-        state.camera,
-        cfg,
-        _views(state, cfg),
-        np.float32(converged(state.residual, cfg)),
-        landmarks(found, state.camera, cfg),
-    )
-    T, info = jax.device_get((T, info))
-    return rigid(T), info
-
-
-def _views(state: SlamState, cfg: Config) -> Views:
-    """Keyframes near the last pose, spread evenly over their list, which begins with the anchor."""
-    last, go = last_pose(state), cfg.track.go
-    submap = state.submap
-    near = [
-        keyframe
-        for keyframe in submap.keyframes
-        if np.all(np.less(distance(keyframe.T_sub_cam, last), (go.view_translation, go.view_rotation)))
-    ] or [submap.keyframes[submap.newest]]
-    chosen = [near[round(i)] for i in np.linspace(0, len(near) - 1, go.views)]
-    return views_of(chosen)
 
 
 def _learn(
     state: SlamState,
     frame: Frame,
-    T_sub_cam: Pose,
+    tracked: Tracked,
     decision: Decision,
-    info: tracking.TrackInfo,
-    track_ms: float,
     cfg: Config,
 ) -> SlamState:
     """Local bundle adjustment with the frame, which becomes a keyframe where that was decided."""
     assert frame.depth is not None
     began = perf_counter()
-    number, ok = len(state.records), True
+    number, ok, T_sub_cam = len(state.records), True, tracked.T_sub_cam
     mapped = frame.color is not None and decision.map_steps > 0
     made = mapped and decision.keyframe
     if mapped:
         current = (_keyframe if made else make_keyframe)(frame, number, T_sub_cam, cfg, state.camera)
+        current = current._replace(covariance=tracked.held.covariance)
         chosen = choose(state.submap, cfg.map.frames - 2, (cfg.seed, CHOOSE, number))
         batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
         steps, share = decision.map_steps, decision.pose_rate
@@ -207,7 +158,7 @@ def _learn(
         T_sub_cam = batch.keyframes[-1].T_sub_cam
         kept = batch if made else batch._replace(keyframes=batch.keyframes[:-1])
         state = state.with_submap(state.active, **kept._asdict())
-    details = _info(info, track_ms)._replace(
+    details = _info(tracked)._replace(
         keyframe=made,
         map_steps=decision.map_steps if mapped else 0,
         map_ms=_ms(began),
@@ -215,7 +166,7 @@ def _learn(
         note=frame.problem if ok else "map not finite",
     )
     record = _record(frame, state, T_sub_cam, decision.status, details)
-    record = record._replace(depth=thumbnail(frame.depth, state.camera))
+    record = record._replace(held=tracked.held, depth=thumbnail(frame.depth, state.camera))
     trouble = 0 if decision.status is Status.OK else state.trouble + 1
     return state._replace(records=(*state.records, record), trouble=trouble)
 
@@ -235,37 +186,19 @@ def _coast(
     note: str,
     status: Status,
     cfg: Config,
-    info: tracking.TrackInfo | None = None,
-    track_ms: float = 0.0,
+    tracked: Tracked | None = None,
 ) -> SlamState:
     """A frame without a trusted pose stays where the camera was seen last; nothing is learned from it."""
     T_sub_cam = last_pose(state)
-    details = FrameInfo() if info is None else _info(info, track_ms)
+    details = FrameInfo() if tracked is None else _info(tracked)
     details = details._replace(note=note, submap=state.active)
-    record = _record(frame, state, T_sub_cam, status, details)
+    record = _record(frame, state, T_sub_cam, status, details)._replace(held=coasting(state, frame, cfg))
     return state._replace(records=(*state.records, record), trouble=state.trouble + 1)
-
-
-def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
-    """Constant velocity over the real time since the last trusted frame, and no motion; the expected one first.
-
-    Over a longer time than velocity is carried on for, it says nothing, and no motion comes first.
-    """
-    last = last_pose(state)
-    if state.motion is None:
-        return [last, last]
-    ratio = (timestamp - _last_trusted(state).timestamp) / max(state.motion.seconds, DT_MIN)
-    moved = last @ _scaled(state.motion.T_older_newer, min(max(ratio, 0.0), DT_RATIO_MAX))
-    return [moved, last] if ratio <= DT_RATIO_MAX else [last, moved]
-
-
-def _last_trusted(state: SlamState) -> Record:
-    return next(r for r in reversed(state.records) if r.status in (Status.OK, Status.WEAK))
 
 
 def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState:
     """With motion and residual after a trusted frame."""
-    newest, older = state.records[-1], _last_trusted(before)
+    newest, older = state.records[-1], last_trusted(before)
     T_older_newer = inverse(pose_of(state, before.records[-1])) @ pose_of(state, newest)
     motion = Motion(T_older_newer, newest.timestamp - older.timestamp)
     over = max(residual - before.residual, 0.0)
@@ -273,16 +206,8 @@ def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState
     return state._replace(motion=motion, residual=floor)
 
 
-def _scaled(motion: Pose, ratio: float) -> Pose:
-    scaled = np.eye(4)
-    scaled[:3, :3] = Rotation.from_rotvec(
-        ratio * Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    ).as_matrix()
-    scaled[:3, 3] = ratio * motion[:3, 3]
-    return scaled
-
-
-def _stats(state: SlamState, depth: np.ndarray, T_sub_cam: Pose, info: tracking.TrackInfo) -> FrameStats:
+def _stats(state: SlamState, depth: np.ndarray, tracked: Tracked) -> FrameStats:
+    T_sub_cam, info = tracked.T_sub_cam, tracked.info
     keyframe, last = state.submap.keyframes[state.submap.newest], last_pose(state)
     translation, rotation = distance(keyframe.T_sub_cam, T_sub_cam)
     step_translation, step_rotation = distance(last, T_sub_cam)
@@ -291,6 +216,7 @@ def _stats(state: SlamState, depth: np.ndarray, T_sub_cam: Pose, info: tracking.
         measured=float(np.mean(depth > 0)),
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
+        open=float(tracked.together.deviation[-1]),
         residual=float(info.after.residual),
         least_residual=state.residual,
         unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),
@@ -318,15 +244,26 @@ def _record(
     return Record(frame.number, frame.timestamp, state.active, keyframe, relative, status, info)
 
 
-def _info(info: tracking.TrackInfo, track_ms: float) -> FrameInfo:
+def _info(tracked: Tracked) -> FrameInfo:
+    before, after, together = tracked.info.before, tracked.info.after, tracked.together
+    metres, radians = deviations(tracked.held.covariance, tracked.T_sub_cam)
     return FrameInfo(
-        residual_before=float(info.before.residual),
-        residual_after=float(info.after.residual),
-        known=float(info.after.known),
-        confirmed=float(info.after.confirmed),
-        searched=bool(info.searched),
-        track_ms=track_ms,
+        residual_before=float(before.residual),
+        residual_after=float(after.residual),
+        known=float(after.known),
+        confirmed=float(after.confirmed),
+        surfaces=_numbers(tracked.surfaces.deviation),
+        together=_numbers(together.deviation),
+        free=_numbers(together.twist[-1]),
+        deviation_m=metres,
+        deviation_deg=float(np.degrees(radians)),
+        searched=bool(tracked.info.searched),
+        track_ms=tracked.ms,
     )
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(f"{value:.2g}" for value in values)
 
 
 def _ms(began: float) -> float:

@@ -13,6 +13,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.volume import Box
 from mipsjax.host.corners import Corners
 from mipsjax.host.features import Features
+from mipsjax.host.held import EXACT, NONE, Held, Matrix
 from mipsjax.policy import Status
 from mipsjax.schedule import Job
 
@@ -37,6 +38,8 @@ class Keyframe(NamedTuple):
     T_sub_cam: Pose
     features: Features | None = None
     """For loops and relocalisation; None where neither is wanted."""
+    covariance: Matrix = NONE
+    """Of its pose, relative to the anchor (`host/held.py`)."""
 
 
 class Submap(NamedTuple):
@@ -71,6 +74,8 @@ class Record(NamedTuple):
     T_keyframe_cam: Pose
     status: Status
     info: FrameInfo
+    held: Held = EXACT
+    """How far the pose in the submap may be off."""
     depth: UInt16[np.ndarray, "h w"] | None = None
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
 
@@ -101,6 +106,16 @@ class FrameInfo(NamedTuple):
     """Share of measured pixels within 5 cm of the mapped surface, before mapping."""
     confirmed: float = float("nan")
     """The same where the map is certain."""
+    surfaces: str = ""
+    """Standard deviations of the pose in the six directions that surfaces hold most to least firmly, metres or rad."""
+    together: str = ""
+    """The same by surfaces and corners of the image."""
+    free: str = ""
+    """Of a weak frame: the motion that these leave most open, (v, omega) in the camera's frame."""
+    deviation_m: float = float("nan")
+    """Standard deviation of where the camera is in its submap."""
+    deviation_deg: float = float("nan")
+    """And of how it is turned."""
     searched: bool = False
     """RO was run."""
     keyframe: bool = False

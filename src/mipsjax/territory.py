@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, random_key, refine, views_of
+from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, nearest, random_key, refine, views_of
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
+from mipsjax.host.held import NONE, Held, Matrix, moved, positive
 from mipsjax.links import chain_distances, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
-from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, last_pose, rigid
 
 AGAIN = 3  # times at most that registration is repeated: from 9 cm off the third moves a frame by millimetres
 VIEWS = 8  # keyframes that say what a submap observed around a guess
@@ -83,7 +83,7 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
             continue
         found = sight(state, place, keyframe, expected, cfg)
         if found is not None:
-            state = link(state, keyframe, found)
+            state = link(state, keyframe, found, cfg)
             sightings.append(found)
     return state, sightings
 
@@ -129,7 +129,7 @@ def sight(
 def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrinsics, cfg: Config) -> Any:
     """On the host. Again from where it ended while that moves it: across a loop the guess may be decimetres off."""
     small, depth = mapping_camera(camera, cfg), jnp.asarray(keyframe.depth)
-    views = views_of(_nearest(submap.keyframes, guess))
+    views = views_of(nearest(submap.keyframes, guess, VIEWS))
 
     def register(T_sub_cam: Pose) -> Any:
         start = jnp.asarray(T_sub_cam, jnp.float32)
@@ -143,16 +143,19 @@ def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrins
     return found
 
 
-def _nearest(keyframes: Sequence[Keyframe], T_sub_cam: Pose) -> list[Keyframe]:
-    """`VIEWS` of them, the nearest first and again where there are fewer."""
-    ordered = sorted(keyframes, key=lambda keyframe: sum(distance(keyframe.T_sub_cam, T_sub_cam)))
-    return [ordered[i % len(ordered)] for i in range(VIEWS)]
-
-
-def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:
+def link(state: SlamState, keyframe: Keyframe, found: Sighting, cfg: Config) -> SlamState:
     """The frame as a keyframe of the submap that it was found in."""
     known = state.submaps[found.submap].keyframes
-    return state.with_submap(found.submap, keyframes=(*known, keyframe._replace(T_sub_cam=found.T_sub_cam)))
+    (beside,) = nearest(known, found.T_sub_cam, 1)
+    covariance = registered(beside, found.T_sub_cam, cfg)
+    shared = keyframe._replace(T_sub_cam=found.T_sub_cam, covariance=covariance)
+    return state.with_submap(found.submap, keyframes=(*known, shared))
+
+
+def registered(beside: Keyframe, T_sub_cam: Pose, cfg: Config) -> Matrix:
+    """Covariance of a frame that was registered in a submap, beside a keyframe of it."""
+    own = np.repeat([cfg.loop.sigma, cfg.loop.sigma_rotation], 3) ** 2
+    return beside.covariance + moved(np.diag(own), T_sub_cam)
 
 
 def govern(state: SlamState, cfg: Config) -> int:
@@ -181,11 +184,19 @@ def _begin_here(state: SlamState, cfg: Config) -> SlamState:
     *before, anchor = old.keyframes
     T_new_old = inverse(anchor.T_sub_cam)
     before.sort(key=lambda keyframe: keyframe.number, reverse=True)
-    support = [k._replace(T_sub_cam=T_new_old @ k.T_sub_cam) for k in before[: cfg.volume.support]]
+    support = [_support(k, anchor, T_new_old) for k in before[: cfg.volume.support]]
     T_world_sub = old.T_world_sub @ anchor.T_sub_cam
-    new, _ = begin(anchor, support, T_world_sub, cfg.map.submap_steps, state.camera, cfg)
+    new, _ = begin(
+        anchor._replace(covariance=NONE), support, T_world_sub, cfg.map.submap_steps, state.camera, cfg
+    )
     new = new._replace(parent=state.active)
     return moved_in(state._replace(submaps=(*state.submaps, new)), len(state.submaps), 0)
+
+
+def _support(keyframe: Keyframe, anchor: Keyframe, T_new_old: Pose) -> Keyframe:
+    """A keyframe of one submap in another that begins at a later one, `anchor`."""
+    since = positive(anchor.covariance - keyframe.covariance)
+    return keyframe._replace(T_sub_cam=T_new_old @ keyframe.T_sub_cam, covariance=moved(since, T_new_old))
 
 
 def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
@@ -203,7 +214,10 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
 
 def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
     """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
-    last = state.records[-1]._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4))
+    own, last = state.submaps[place].keyframes[keyframe], state.records[-1]
+    T_new_old = own.T_sub_cam @ inverse(last_pose(state))
+    held = Held(own.covariance, moved(last.held.motion, T_new_old))
+    last = last._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4), held=held)
     return activated(state, place)._replace(records=(*state.records[:-1], last))
 
 

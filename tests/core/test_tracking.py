@@ -16,8 +16,8 @@ from planes import plane
 
 from mipsjax.core import field as nf
 from mipsjax.core import solvers, tracking
-from mipsjax.core.views import Views
 from mipsjax.core.camera import transform
+from mipsjax.core.views import Views
 
 KEY = jax.random.key(7)
 WIDENING = np.float32(1)
@@ -112,7 +112,7 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
         weight = precision * pulls / (1 + (psi(twist) / cfg.track.go.robust) ** 2)
         rows = jax.jacfwd(psi)(twist)
         expected = solvers.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
-        return solvers.map_system(corner_map.field, T, points, part, cfg), expected
+        return solvers.map_rows(corner_map.field, T, points, part, cfg).system(), expected
 
     for found, expected in zip(*derivatives(jnp.zeros(6)), strict=True):
         # Sums of 768 float32 numbers in another order, of which those of the slope partly cancel
@@ -282,13 +282,14 @@ def test_the_robust_cost():
     assert (cost <= psi**2 + 1e-9).all() and (np.diff(cost[5:]) > 0).all()
 
 
-def landmarks_of(T_sub_cam, p_sub, noise=0.0) -> solvers.Landmarks:
+def landmarks_of(T_sub_cam, p_sub, noise=0.0, axes=None) -> solvers.Landmarks:
     """Where points of the submap are seen from a pose; those behind the camera are fillers."""
     p_cam = np.asarray(transform(jnp.asarray(np.linalg.inv(T_sub_cam), jnp.float32), p_sub))
     mask = p_cam[:, 2] > 0.1
     ray = p_cam[:, :2] / np.where(mask, p_cam[:, 2], 1)[:, None]
     ray = ray + noise * np.random.default_rng(0).normal(size=ray.shape)
-    return solvers.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), jnp.asarray(mask))
+    axes = jnp.asarray(np.tile(np.eye(2), (len(mask), 1, 1)) if axes is None else axes, jnp.float32)
+    return solvers.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), axes, jnp.asarray(mask))
 
 
 def test_the_equations_of_landmarks_against_automatic_derivatives(points):

@@ -19,12 +19,15 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics, transform
-from mipsjax.core.views import Views, plane_errors
+from mipsjax.core.views import PlaneErrors, Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
+PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
+PROBE = 0.02  # metres by which the frame is moved for that: more than the noise of depth
+PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
 PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
@@ -43,6 +46,9 @@ class Landmarks(NamedTuple):
     p_sub: Float[Array, "N 3"]
     ray: Float[Array, "N 2"]
     """Where they are seen: image point at focal length 1."""
+    axes: Float[Array, "N 2 2"]
+    """What an error of that is multiplied by: rows are directions in the image, of length 1 where it is known as well
+    as can be, 0 where it is not known at all."""
     mask: Bool[Array, " N"]
     """False fills up to a fixed number."""
 
@@ -65,6 +71,33 @@ class System(NamedTuple):
     cost: Float[Array, ""]
     hessian: Float[Array, "6 6"]
     slope: Float[Array, "6"]
+
+
+class Rows(NamedTuple):
+    """P residuals that are to vanish; what follows from them is summed over P."""
+
+    residual: Float[Array, "*K P"]
+    """Metres."""
+    jacobian: Float[Array, "*K P 6"]
+    """By a twist (v, omega) in the camera's frame."""
+    weight: Float[Array, "*K P"]
+    cost: Float[Array, "*K P"]
+
+    def system(self) -> System:
+        """Of all rows together."""
+        rows = self.jacobian.reshape(-1, 6)
+        weighted = rows.T * self.weight.reshape(-1)[None]
+        return System(jnp.sum(self.cost), weighted @ rows, weighted @ self.residual.reshape(-1))
+
+
+class Information(NamedTuple):
+    """How firmly a frame is held: inverse covariances of its pose, for a twist (v, omega) in the camera's frame,
+    1/m^2 and 1/rad^2, as if each point and corner erred alone."""
+
+    surfaces: Float[Array, "6 6"]
+    """By the map and the depth images of keyframes."""
+    corners: Float[Array, "6 6"]
+    """By corners of the image."""
 
 
 class Evidence(NamedTuple):
@@ -121,38 +154,75 @@ def levenberg_marquardt(
 def systems(
     field: nf.Field, T: Float[Array, "4 4"], seen: Evidence, part: nf.Part, camera: Intrinsics, cfg: Config
 ) -> tuple[System, System]:
-    """Normal equations of surfaces (the field and depth images of keyframes), and of corners of the image.
-
-    Of a twist (v, omega) in the camera's frame.
-    """
-    surfaces = map_system(field, T, seen.points, part, cfg)
+    """Normal equations of surfaces (the field and depth images of keyframes), and of corners of the image."""
+    surfaces = map_rows(field, T, seen.points, part, cfg).system()
     if seen.views is not None:
-        views = view_systems(T, seen.points, seen.views, camera, cfg)
-        surfaces = jax.tree.map(lambda a, b: a + jnp.sum(b, 0), surfaces, views)
+        views = view_rows(T, seen.points, seen.views, camera, cfg).system()
+        surfaces = jax.tree.map(jnp.add, surfaces, views)
     if seen.landmarks is None:
         return surfaces, jax.tree.map(jnp.zeros_like, surfaces)
     return surfaces, landmark_system(T, seen.landmarks, camera, cfg)
 
 
-def view_systems(
-    T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config
-) -> System:
-    """Normal equations of the points' distances to the surface in each keyframe's depth image."""
-    go, precision = cfg.track.go, precisions(points, cfg)
+def information(
+    field: nf.Field, T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config
+) -> Information:
+    """What holds a frame at the pose that was found.
+
+    Normals are noisy: along a bare wall they seem to hold a frame that slides freely. Along the directions in which
+    the normal equations are weakest it is therefore measured how distances change when the frame is moved: the product
+    of noisy normals and of a change that does not know of this noise has the right mean.
+    """
+    variance = cfg.sensor.noise_floor**2
+    on_map, on_views = map_rows(field, T, seen.points, "whole", cfg), None
+    hessian = on_map.system().hessian
+    if seen.views is not None:
+        on_views = view_rows(T, seen.points, seen.views, camera, cfg)
+        hessian += on_views.system().hessian
+    strength, directions = jnp.linalg.eigh(hessian)
+
+    def moved(twist):
+        T_moved = T @ jaxlie.SE3.exp(twist).as_matrix()
+        psi = nf.tsdf(field, transform(T_moved, seen.points.p_cam), cfg.field, "whole").psi
+        return psi, None if seen.views is None else _view_errors(T_moved, seen.points, seen.views, camera)
+
+    def measured(direction):
+        shift, turn = jnp.linalg.norm(direction[:3]), jnp.linalg.norm(direction[3:])
+        size = PROBE / jnp.maximum(shift, PROBE_REACH * turn)
+        (psi, errors), (psi_back, errors_back) = moved(size * direction), moved(-size * direction)
+        total = jnp.sum(on_map.weight * (on_map.jacobian @ direction) * (psi - psi_back))
+        if on_views is not None and errors is not None and errors_back is not None:
+            both = errors.mask & errors_back.mask
+            change = both * (errors.distance - errors_back.distance)
+            total += jnp.sum(on_views.weight * (on_views.jacobian @ direction) * change)
+        return total / (2 * size)
+
+    weakest = directions[:, :PROBED].T
+    excess = strength[:PROBED] - jnp.maximum(jax.lax.map(measured, weakest), 0)
+    held = hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
+    if seen.landmarks is None:
+        return Information(held / variance, jnp.zeros((6, 6)))
+    return Information(held / variance, landmark_system(T, seen.landmarks, camera, cfg).hessian / variance)
+
+
+def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
+    """The points' distances to the surface in the depth image of each of K keyframes."""
+    go, precision, errors = cfg.track.go, precisions(points, cfg), _view_errors(T, points, views, camera)
+    weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / go.view_robust) ** 2)
+    # A point that falls on nothing costs as much as one that is as far off as is allowed
+    off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
+    cost = go.view_weight * robust_cost(off, go.view_robust) * precision
+    jacobian = jax.vmap(partial(_jacobian, T, points))(errors.normal)
+    return Rows(errors.distance, jacobian, weight, cost)
+
+
+def _view_errors(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics) -> PlaneErrors:
     small = camera.decimated(round(camera.width / views.depth.shape[2]))
-
-    def one(errors):
-        rows, narrow = _jacobian(T, points, errors.normal), go.view_robust
-        weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / narrow) ** 2)
-        # A point that falls on nothing costs as much as one that is as far off as is allowed
-        off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
-        return _system(errors.distance, rows, weight, go.view_weight * robust_cost(off, narrow) * precision)
-
-    return jax.vmap(one)(plane_errors(views, transform(T, points.p_cam), small, VIEW_REACH))
+    return plane_errors(views, transform(T, points.p_cam), small, VIEW_REACH)
 
 
-def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> System:
-    """Normal equations of the points' distances at a pose, for a twist (v, omega) in the camera's frame."""
+def map_rows(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> Rows:
+    """The points' distances in the map at a pose."""
 
     def distance(p_sub):
         prediction = nf.tsdf(field, p_sub, cfg.field, part)
@@ -160,12 +230,12 @@ def map_system(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf
 
     go, scale = cfg.track.go, cfg.track.go.robust
     psi, pull, entropy = jax.vjp(distance, transform(T, points.p_cam), has_aux=True)
-    rows = _jacobian(T, points, pull(jnp.ones_like(psi))[0])
+    jacobian = _jacobian(T, points, pull(jnp.ones_like(psi))[0])
     precision = precisions(points, cfg)
     weight = precision * (jnp.abs(psi) < SATURATED * cfg.field.truncation) / (1 + (psi / scale) ** 2)
     if go.uncertainty:
         weight *= losses.certainty(entropy, go.entropy_floor)
-    return _system(psi, rows, weight, robust_cost(psi, scale) * precision)
+    return Rows(psi, jacobian, weight, robust_cost(psi, scale) * precision)
 
 
 def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrinsics, cfg: Config) -> System:
@@ -180,19 +250,19 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
     in_front = p_cam[:, 2] > sampling.NEAR
     z = jnp.where(in_front, p_cam[:, 2], 1.0)
     aim = p_cam[:, :2] / z[:, None]
-    error = metres * (aim - landmarks.ray)
+    error = metres * jnp.einsum("nij,nj->ni", landmarks.axes, aim - landmarks.ray)
     # T exp(xi) moves a point of the submap by -v - omega x p in the camera's frame
     zero, one = jnp.zeros_like(z), jnp.ones_like(z)
     gradient = jnp.stack(
         [jnp.stack([one, zero, -aim[:, 0]], -1), jnp.stack([zero, one, -aim[:, 1]], -1)], axis=1
     )
-    gradient *= (metres / z)[:, None, None]
+    gradient = landmarks.axes @ gradient * (metres / z)[:, None, None]
     rows = jnp.concatenate([-gradient, -jnp.cross(p_cam[:, None], gradient)], -1)
     scale = corners.robust * cfg.sensor.noise_floor
     squared = jnp.sum(error**2, -1)
     weight = corners.weight * (landmarks.mask & in_front) / (1 + squared / scale**2)
     cost = corners.weight * landmarks.mask * scale**2 * jnp.log1p(squared / scale**2)
-    return _system(error.reshape(-1), rows.reshape(-1, 6), jnp.repeat(weight, 2), cost)
+    return Rows(error, rows, jnp.repeat(weight[:, None], 2, 1), cost).system()
 
 
 def prior_system(T: Float[Array, "4 4"], expected: Float[Array, "4 4"], cfg: Config) -> System:
@@ -210,16 +280,6 @@ def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 
     """Of distances with this gradient in the submap's frame."""
     gradient = gradient @ T[:3, :3]
     return jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
-
-
-def _system(
-    residual: Float[Array, " P"],
-    jacobian: Float[Array, "P 6"],
-    weight: Float[Array, " P"],
-    cost: Float[Array, " P"],
-) -> System:
-    weighted = jacobian.T * weight[None]
-    return System(jnp.sum(cost), weighted @ jacobian, weighted @ residual)
 
 
 def adam(

@@ -19,13 +19,14 @@ from mipsjax.core import losses, particles
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, transform
 from mipsjax.core.solvers import (
     Evidence,
+    Information,
     Landmarks,
     Points,
     adam,
+    information,
     levenberg_marquardt,
-    map_system,
+    map_rows,
     robust_cost,
-    systems,
 )
 from mipsjax.core.views import Views, observed
 
@@ -41,16 +42,6 @@ class Fit(NamedTuple):
     """Share of measured pixels within `keyframe.error` of the mapped surface."""
     confirmed: Float[Array, ""]
     """The same where the map is also certain: space that was never observed looks like surface, but not certainly."""
-
-
-class Information(NamedTuple):
-    """How firmly a frame is held: inverse covariances of its pose, for a twist (v, omega) in the camera's frame,
-    1/m^2 and 1/rad^2, as if every point erred alone by `sensor.noise_floor`."""
-
-    surfaces: Float[Array, "6 6"]
-    """By the map and the depth images of keyframes."""
-    corners: Float[Array, "6 6"]
-    """By corners of the image."""
 
 
 class TrackInfo(NamedTuple):
@@ -106,12 +97,13 @@ def track(
     views: Views | None = None,
     converged: Float[Array, ""] | None = None,
     landmarks: Landmarks | None = None,
+    known: Views | None = None,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
 
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to. `landmarks` are corners of earlier frames, which these steps keep where the frame
-    shows them.
+    shows them. `known` are more keyframes: the second-order steps trust the field only where these observed something.
 
     The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
     field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
@@ -127,7 +119,12 @@ def track(
     search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
     start = candidates[jnp.argmin(search_cost.at[0].multiply(cfg.track.rest))]
     before = measure_fit(field, start, points, "whole", cfg)
-    seen = Evidence(points, views, landmarks, start)
+    trusted = points
+    if known is not None:
+        small = camera.decimated(round(camera.width / known.depth.shape[2]))
+        learned = observed(known, transform(start, points.p_cam), small, BEHIND)
+        trusted = points._replace(mask=points.mask & learned)
+    seen = Evidence(trusted, views, landmarks, start)
 
     limit = ro.residual if converged is None else converged
     smooth = go.method == "lm" and cfg.field.encoding == "both"
@@ -171,10 +168,7 @@ def track(
         T, after = found
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     T = jnp.where(ok, T, start)
-    held = [
-        system.hessian / cfg.sensor.noise_floor**2 for system in systems(field, T, seen, "whole", camera, cfg)
-    ]
-    return T, TrackInfo(before, after, Information(*held), used_ro, ok)
+    return T, TrackInfo(before, after, information(field, T, seen, camera, cfg), used_ro, ok)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
@@ -242,7 +236,7 @@ def register(
     if cfg.field.encoding == "both":
         T = levenberg_marquardt(field, T, Evidence(points), "search", cfg.track.go.smooth_steps, camera, cfg)
     T = levenberg_marquardt(field, T, Evidence(points, views), "whole", cfg.track.go.steps, camera, cfg)
-    hessian = map_system(field, T, points, "whole", cfg).hessian
+    hessian = map_rows(field, T, points, "whole", cfg).system().hessian
     held = jnp.linalg.eigvalsh(hessian)[0] / jnp.maximum(jnp.sum(points.mask), 1)
     prediction = nf.tsdf(field, transform(T, every.p_cam), cfg.field)
     certain = known(T) & nf.is_certain(prediction.entropy, cfg.correspond.max_entropy, cfg.field)

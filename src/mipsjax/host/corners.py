@@ -43,6 +43,9 @@ class Corners(NamedTuple):
     pixel: Float32[np.ndarray, "N 2"]
     p_cam: Float32[np.ndarray, "N 3"]
     """Metres, in the frame's own camera."""
+    axes: Float32[np.ndarray, "N 2 2"]
+    """Rows: the direction across which the image around a corner changes most, of length 1, and the other one, the
+    shorter the less it changes along it. What is followed along an edge slides on it."""
 
 
 class Followed(NamedTuple):
@@ -52,6 +55,8 @@ class Followed(NamedTuple):
     """Metres, in the camera of the earlier frame."""
     pixel: Float64[np.ndarray, "N 2"]
     """In the current image."""
+    axes: Float32[np.ndarray, "N 2 2"]
+    """As in `Corners`."""
     T_ref_cam: Float64[np.ndarray, "4 4"]
     """The motion that they agree on."""
 
@@ -73,8 +78,25 @@ def corners(
     pixel = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
     surface, z = surface_depth(depth, pixel)
     pixel, z = pixel[surface], z[surface]
+    axes = _axes(grey, pixel)
     x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
-    return Corners(record, grey, pixel, np.stack([x * z, y * z, z], 1).astype(np.float32))
+    return Corners(record, grey, pixel, np.stack([x * z, y * z, z], 1).astype(np.float32), axes)
+
+
+def _axes(grey: UInt8[np.ndarray, "H W"], pixel: Float32[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2 2"]:
+    """Of the structure tensor of the window around each corner, divided by its larger eigenvalue: its root.
+
+    Pictures of one place differ by more than noise, by perspective and by light, and the more where they change more:
+    what that moves a corner by is in proportion to the larger gradient over that along which it moves.
+    """
+    u, v = np.clip(np.rint(pixel).astype(int), 0, np.array(grey.shape[::-1]) - 1).T
+    x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    xx, xy, yy = (cv2.boxFilter(part, -1, (WINDOW_PX, WINDOW_PX))[v, u] for part in (x * x, x * y, y * y))
+    tensor = np.stack([np.stack([xx, xy], 1), np.stack([xy, yy], 1)], 1)
+    strength, directions = np.linalg.eigh(tensor)
+    largest = np.maximum(strength[:, 1:], np.finfo(np.float32).tiny)
+    length = np.sqrt(np.maximum(strength, 0) / largest)
+    return (length[..., None] * directions.swapaxes(1, 2))[:, ::-1]
 
 
 def follow(
@@ -89,18 +111,18 @@ def follow(
     None where fewer than `fewest` are found there and back again and agree on one motion.
     """
     guess, visible = _project(reference.p_cam, np.linalg.inv(T_ref_cam), camera)
-    pixel, p_ref = reference.pixel[visible], reference.p_cam[visible]
+    pixel, p_ref, axes = (part[visible] for part in (reference.pixel, reference.p_cam, reference.axes))
     if len(pixel) < fewest:
         return None
     there, back = _there_and_back(reference.grey, grey, pixel, guess[visible])
-    p_ref, there = p_ref[back].astype(np.float64), there[back].astype(np.float64)
+    p_ref, there, axes = p_ref[back].astype(np.float64), there[back].astype(np.float64), axes[back]
     if len(there) < fewest:
         return None
     motion = _motion(p_ref, there, fewest, camera)
     if motion is None:
         return None
     T_ref_cam, agreed = motion
-    return Followed(p_ref[agreed], there[agreed], T_ref_cam)
+    return Followed(p_ref[agreed], there[agreed], axes[agreed], T_ref_cam)
 
 
 def _project(
