@@ -6,7 +6,8 @@ something well behind it contradicts it: at least one of the poses, or the depth
 natural: something in front hides the surface.
 
 Distances are compared by tiles of small images. The median of a tile is free of most of the sensor's noise, and of
-stray pixels; what remains is compared with the sensor's model. Metres.
+stray pixels; what remains is compared with the sensor's model. What others look through both before and after was
+there for a moment only: it moves, and does not count. Metres.
 """
 
 from __future__ import annotations
@@ -84,15 +85,23 @@ class Pairs(NamedTuple):
     later: Int[np.ndarray, " P"]
 
 
+class Tiles(NamedTuple):
+    """Of one view of each pair, its tiles against the other view."""
+
+    through: Bool[np.ndarray, "P K"]
+    """The other looks through them."""
+    compared: Bool[np.ndarray, "P K"]
+
+
 class Part(NamedTuple):
     """A piece of the path, by neighbouring pairs of one level."""
 
     share: float
     """Of tiles that are looked through, the median of the pairs."""
     first: int
-    """The earliest view of these pairs."""
+    """Place of the earliest view of these pairs."""
     last: int
-    """The latest."""
+    """Place of the latest."""
 
 
 class Agreement(NamedTuple):
@@ -101,7 +110,7 @@ class Agreement(NamedTuple):
     worst: Part
     """Where most is looked through."""
     begins: Part | None
-    """The part over the limit that ends first; None where all are below it."""
+    """The part over the limit that ends first, by when something must have gone wrong; None where all are below it."""
     pairs: int
     """That had enough in common."""
 
@@ -142,15 +151,16 @@ def looked_through(views: Views, noise: Noise) -> tuple[Pairs, Float64[np.ndarra
     smooth = surfaces(depth, views.camera, noise)
     place = views.T_world_cam[:, :3, 3]
     path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
-    share = np.full(len(pairs.level), np.nan)
-    for start in range(0, len(share), CHUNK):
-        here = slice(start, start + CHUNK)
-        a, b = pairs.earlier[here], pairs.later[here]
-        allowed = DRIFT * (path[b] - path[a])
-        ways = [_tiles(views, smooth, noise, *way, allowed) for way in ((a, b), (b, a))]
-        through, compared = (np.sum([way[k] for way in ways], axis=0) for k in range(2))
-        share[here] = np.where(compared >= FEWEST_TILES, through / np.maximum(compared, 1), np.nan)
-    return pairs, share
+    allowed = DRIFT * (path[pairs.later] - path[pairs.earlier])
+    earlier = _tiles(views, smooth, noise, pairs.earlier, pairs.later, allowed)
+    later = _tiles(views, smooth, noise, pairs.later, pairs.earlier, allowed)
+    moment = _there_for_a_moment(len(depth), pairs, earlier, later)
+    through, compared = np.zeros((2, len(allowed)), int)
+    for tiles, number in ((earlier, pairs.earlier), (later, pairs.later)):
+        stays = ~moment[number]
+        through += (tiles.through & stays).sum(1)
+        compared += (tiles.compared & stays).sum(1)
+    return pairs, np.where(compared >= FEWEST_TILES, through / np.maximum(compared, 1), np.nan)
 
 
 def surfaces(
@@ -185,30 +195,43 @@ def parts(pairs: Pairs, share: Float64[np.ndarray, " P"]) -> list[Part]:
     return found
 
 
+def _there_for_a_moment(views: int, pairs: Pairs, earlier: Tiles, later: Tiles) -> Bool[np.ndarray, "N K"]:
+    """Tiles of each view that some view before it looks through, and some view after it. Where a camera slides it is
+    one or the other."""
+    before, after = np.zeros((2, views, earlier.through.shape[1]), bool)
+    np.logical_or.at(before, pairs.later, later.through)
+    np.logical_or.at(after, pairs.earlier, earlier.through)
+    return before & after
+
+
 def _tiles(
     views: Views,
     smooth: Bool[np.ndarray, "N h w"],
     noise: Noise,
-    a: Int[np.ndarray, " C"],
-    b: Int[np.ndarray, " C"],
-    allowed: Float64[np.ndarray, " C"],
-) -> tuple[Int[np.ndarray, " C"], Int[np.ndarray, " C"]]:
-    """Of each pair, how many tiles of `a` that `b` looks through, and how many can be compared."""
-    z_a, z, u, v = _seen_from(views, a, b)
-    measured = _measured_at(views.depth[b], u, v, noise)
-    with np.errstate(invalid="ignore"):
-        comparable = smooth[a] & (z < FARTHER * z_a) & np.isfinite(measured)
-        limit = DEVIATIONS * np.hypot(noise(z_a), noise(measured)) + allowed[:, None, None]
-        behind = np.where(comparable, (measured - z) / limit, np.nan)
-    median, count = _tile_medians(behind)
-    enough = count >= FEWEST_PIXELS
-    return (enough & (median > 1)).sum(1), enough.sum(1)
+    of: Int[np.ndarray, " P"],
+    other: Int[np.ndarray, " P"],
+    allowed: Float64[np.ndarray, " P"],
+) -> Tiles:
+    """Tiles of `of` that `other` looks through by more than the noise and `allowed` metres."""
+    rows, columns = (size // TILE for size in views.depth.shape[1:])
+    tiles = Tiles(*np.zeros((2, len(of), rows * columns), bool))
+    for start in range(0, len(of), CHUNK):
+        here = slice(start, start + CHUNK)
+        z_of, z, u, v = _seen_from(views, of[here], other[here])
+        measured = _measured_at(views.depth[other[here]], u, v, noise)
+        with np.errstate(invalid="ignore"):
+            comparable = smooth[of[here]] & (z < FARTHER * z_of) & np.isfinite(measured)
+            limit = DEVIATIONS * np.hypot(noise(z_of), noise(measured)) + allowed[here, None, None]
+            median, count = _tile_medians(np.where(comparable, (measured - z) / limit, np.nan))
+            tiles.compared[here] = count >= FEWEST_PIXELS
+            tiles.through[here] = tiles.compared[here] & (median > 1)
+    return tiles
 
 
 def _seen_from(
     views: Views, a: Int[np.ndarray, " C"], b: Int[np.ndarray, " C"]
 ) -> tuple[Float[np.ndarray, "C h w"], ...]:
-    """Depth of all pixels of `a`, from `a` and from `b`, and where they are in the images of `b` (u, v)."""
+    """Depth of all pixels of views `a`, from there and from views `b`; where they are in the images of `b` (u, v)."""
     camera, z_a = views.camera, views.depth[a].astype(np.float32)
     height, width = z_a.shape[1:]
     T_b_a = (np.linalg.inv(views.T_world_cam[b]) @ views.T_world_cam[a]).astype(np.float32)
@@ -253,7 +276,7 @@ def _tile_medians(
     left out."""
     rows, columns = (size // TILE for size in values.shape[1:])
     cut = values[:, : rows * TILE, : columns * TILE]
-    tiles = cut.reshape(-1, rows, TILE, columns, TILE).transpose(0, 1, 3, 2, 4)
+    tiles = cut.reshape(len(values), rows, TILE, columns, TILE).transpose(0, 1, 3, 2, 4)
     ordered = np.sort(tiles.reshape(len(values), rows * columns, TILE * TILE), axis=-1)
     count = np.isfinite(ordered).sum(-1)
     middle = np.maximum(count - 1, 0) // 2
