@@ -39,7 +39,7 @@ WINDOW = 8
 SHORTEST = 2
 """Views between the frames of the nearest pairs; the next are twice as far apart, and so on."""
 MOST_VIEWS = 400
-"""Spread evenly over a long run, so that the time this takes is bounded: 2 to 3 s on one core."""
+"""Spread evenly over a long run, so that the time this takes is bounded: about 1 s on one core."""
 CHUNK = 32
 """Pairs at a time, which bounds the memory."""
 APART = 1.0
