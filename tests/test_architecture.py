@@ -24,7 +24,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"territory", "background", "surfaces", "tracker"}),
     frozenset({"closure"}),
     frozenset({"recovery"}),
-    frozenset({"slam", "final"}),
+    frozenset({"slam", "final", "judge"}),
     frozenset({"reconstruct", "outputs", "summary", "options", "commandline"}),
     frozenset({"run", "evaluate"}),
 )

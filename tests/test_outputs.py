@@ -24,6 +24,7 @@ from mipsjax.data.open import open_sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import OutputError
 from mipsjax.files import write_atomically
+from mipsjax.host.agreement import Agreement, Part
 from mipsjax.policy import Status
 from mipsjax.presets import preset
 from mipsjax.reconstruct import observed_points, reconstruct
@@ -79,6 +80,29 @@ def row(status: str) -> FrameRow:
 )
 def test_verdict(statuses: str, expected: str) -> None:
     assert verdict(tuple(row(status) for status in statuses.split())) == expected
+
+
+def test_a_run_whose_depth_images_contradict_each_other_is_degraded(run: Run) -> None:
+    part = Part(0.3, 0, 2)
+    contradicted = run._replace(agreement=Agreement(part, part, 20))
+    content = metrics_content(contradicted, None, {})
+    assert content["status"] == "degraded" and content["looked_through"] == 0.3
+    assert content["contradiction"] == {
+        "indices": [1, 3],
+        "timestamps": [run.rows[1].timestamp, run.rows[3].timestamp],
+        "looked_through": 0.3,
+    }
+    (reason,) = content["reasons"]
+    assert "30 %" in reason and "between frames 1 and 3" in reason
+    assert json.loads(outputs.events_jsonl(contradicted, []).splitlines()[-1])["status"] == "degraded"
+
+
+def test_a_run_whose_depth_images_agree_or_cannot_be_compared_is_ok(run: Run) -> None:
+    agreeing = metrics_content(run._replace(agreement=Agreement(Part(0.01, 0, 2), None, 20)), None, {})
+    assert (agreeing["status"], agreeing["looked_through"], agreeing["reasons"]) == ("ok", 0.01, [])
+    unknown = metrics_content(run, None, {})
+    assert (unknown["status"], unknown["looked_through"], unknown["contradiction"]) == ("ok", None, None)
+    assert "too few" in unknown["protocol"]["looked_through"]
 
 
 def test_metrics_count_what_happened(run: Run) -> None:

@@ -15,7 +15,7 @@ from mipsjax.core import tracking
 from mipsjax.links import unjoined
 from mipsjax.rest import rested
 from mipsjax.schedule import INLINE, Executor
-from mipsjax.state import THUMBNAIL_UNIT, Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride
+from mipsjax.state import Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride, to_metres
 
 log = logging.getLogger(__name__)
 
@@ -68,17 +68,12 @@ def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
     places = [i for i, r in enumerate(records) if r.submap == place and r.depth is not None]
     for group in (places[i : i + ALIGNED] for i in range(0, len(places), ALIGNED)):
         filled = [group[i % len(group)] for i in range(ALIGNED)]
-        depth = np.stack([_depth(records[i]) for i in filled])
+        depth = np.stack([to_metres(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
         poses = np.asarray(tracking.align(submap.learned.field, jnp.asarray(depth), start, small, cfg))
         for i, pose in zip(group, poses, strict=False):
             records[i] = _moved(records[i], rigid(pose), submap.keyframes)
     return state._replace(records=tuple(records))
-
-
-def _depth(record: Record) -> np.ndarray:
-    assert record.depth is not None
-    return record.depth.astype(np.float32) * np.float32(THUMBNAIL_UNIT)
 
 
 def _moved(record: Record, T_sub_cam: Pose, keyframes: tuple[Keyframe, ...]) -> Record:

@@ -198,7 +198,7 @@ def events_jsonl(run: Run, notes: Iterable[str]) -> str:
             events.append({"event": "recovered", **where})
         last = last if row.status is Status.SKIPPED else row.status
     events += [{"event": "warning", "text": note} for note in notes]
-    events.append({"event": "end", "how": run.end, "status": verdict(run.rows)})
+    events.append({"event": "end", "how": run.end, "status": verdict(run.rows, run.agreement)})
     return "".join(json.dumps(_finite(event), allow_nan=False) + "\n" for event in events)
 
 

@@ -25,6 +25,7 @@ from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frame
 from mipsjax.data.sequence import Sequence
 from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
 from mipsjax.final import finish
+from mipsjax.judge import judged
 from mipsjax.policy import Status
 from mipsjax.reconstruct import reconstruct
 from mipsjax.schedule import executor
@@ -96,12 +97,16 @@ def _run(options: Options) -> int:
         tell("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
         with _progress(len(sequence), options.quiet) as tell_status:
             run = travel(sequence, cfg, stop, tell_status)
-        if run.state is None:
+        state = run.state
+        if state is None:
             raise _nothing_usable(run)
         _return_memory()
         began = perf_counter()
-        mesh = None if options.no_mesh else reconstruct(run.state, cfg)
-        seconds = {"open": opened_s, "mesh": perf_counter() - began}
+        run = run._replace(agreement=judged(state, cfg))
+        judged_s = perf_counter() - began
+        began = perf_counter()
+        mesh = None if options.no_mesh else reconstruct(state, cfg)
+        seconds = {"open": opened_s, "judge": judged_s, "mesh": perf_counter() - began}
         content = outputs.write_results(folder, run, mesh, seconds, remarks)
         tell(_summary(content))
         return _exit_code(run, folder)

@@ -250,3 +250,9 @@ def thumbnail(depth: Float32[np.ndarray, "h w"], camera: Intrinsics) -> UInt16[n
     every = thumbnail_stride(camera)
     units = np.round(depth[::every, ::every] / THUMBNAIL_UNIT)
     return np.where(units < 2**16, units, 0).astype(np.uint16)
+
+
+def to_metres(record: Record) -> Float32[np.ndarray, "h w"]:
+    """The thumbnail of a frame that has one, as depth; 0 for no measurement."""
+    assert record.depth is not None
+    return record.depth.astype(np.float32) * np.float32(THUMBNAIL_UNIT)

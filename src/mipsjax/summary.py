@@ -16,6 +16,8 @@ from mipsjax.data.sequence import Sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import InputError
 from mipsjax.host import metrics, surface
+from mipsjax.host.agreement import DEVIATIONS, DRIFT, LIMIT, Agreement
+from mipsjax.judge import contradiction
 from mipsjax.links import unjoined
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, SlamState, keyframes, map_bytes, trajectory
@@ -61,6 +63,8 @@ class Run(NamedTuple):
     end: Literal["done", "interrupted", "bad frames"]
     finish_s: float = 0.0
     """Seconds of the bundle adjustment after the last frame."""
+    agreement: Agreement | None = None
+    """Of the depth images with each other, by places in the state's records; None where it cannot be told."""
 
     @property
     def rows(self) -> tuple[FrameRow, ...]:
@@ -84,21 +88,32 @@ class Number(NamedTuple):
     protocol: str
 
 
-def verdict(rows: tuple[FrameRow, ...]) -> Verdict:
+def verdict(rows: tuple[FrameRow, ...], agreement: Agreement | None = None) -> Verdict:
     """`failed`: lost at the end, or in more than half of the frames, or no frame after the first was usable;
-    `degraded`: lost at times."""
+    `degraded`: lost at times, or depth images contradict each other."""
     tracked = [row.status for row in rows if row.status is not Status.SKIPPED]
     lost = tracked.count(Status.LOST)
     if len(tracked) < 2 or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
         return "failed"
-    return "degraded" if lost else "ok"
+    contradicted = agreement is not None and agreement.begins is not None
+    return "degraded" if lost or contradicted else "ok"
+
+
+def reasons(run: Run) -> list[str]:
+    """Why a run is not `ok`, or might not be; empty where there is nothing to say."""
+    statuses = [row.status for row in run.rows]
+    lost, contradicted = statuses.count(Status.LOST), ""
+    if run.agreement is not None and run.state is not None:
+        contradicted = contradiction(run.state, run.agreement)
+    found = [f"lost in {lost} of {len(statuses)} frames"] if lost else []
+    return [*found, contradicted] if contradicted else found
 
 
 def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, float]) -> dict[str, Any]:
     """All numbers of metrics.json. `run` has a state."""
     assert run.state is not None
     rows, began = run.rows, perf_counter()
-    numbers = {**_speed(run), **trajectory_errors(run)}
+    numbers = {**_speed(run), "looked_through": looked_through(run), **trajectory_errors(run)}
     if mesh is not None and isinstance(run.sequence, SynthSequence):
         numbers |= surface_errors(run.sequence, run, mesh)
     stages = {
@@ -114,7 +129,8 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
     stages["submaps"] = sum(row.info.order_ms for row in rows) / 1e3
     return {
         "schema_version": SCHEMA_VERSION,
-        "status": verdict(rows),
+        "status": verdict(rows, run.agreement),
+        "reasons": reasons(run),
         "end": run.end,
         "frames": len(rows),
         "seconds": total,
@@ -133,8 +149,34 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
             for row in rows
             if row.info.note and row.status != "lost"
         ],
+        "contradiction": contradicted_part(run),
         **{name: number.value for name, number in numbers.items()},
         "protocol": {name: number.protocol for name, number in numbers.items()},
+    }
+
+
+def looked_through(run: Run) -> Number:
+    """The share that decides whether depth images agree, at the part of the path where it is greatest."""
+    if run.agreement is None:
+        return Number(None, "too few frames see the same for depth images to be compared")
+    return Number(
+        run.agreement.worst.share,
+        "share of tiles of small depth images that another frame looks through, by more than "
+        f"{DEVIATIONS:g} deviations of the sensor's noise and {100 * DRIFT:g} % of the path between the two; "
+        f"median of neighbouring pairs, greatest of {run.agreement.pairs} pairs; over {LIMIT:g} is degraded",
+    )
+
+
+def contradicted_part(run: Run) -> dict[str, Any] | None:
+    """The part of the path where depth images begin to contradict each other; None where they agree."""
+    if run.state is None or run.agreement is None or run.agreement.begins is None:
+        return None
+    part = run.agreement.begins
+    ends = [run.state.records[place] for place in (part.first, part.last)]
+    return {
+        "indices": [record.frame for record in ends],
+        "timestamps": [record.timestamp for record in ends],
+        "looked_through": part.share,
     }
 
 
