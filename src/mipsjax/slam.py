@@ -17,7 +17,7 @@ from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.host.held import NONE, Held, deviations
+from mipsjax.host.held import EXACT, at, deviations
 from mipsjax.landmarks import with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
@@ -128,7 +128,7 @@ def _recover(state: SlamState, frame: Frame, note: str, tracked: Tracked, cfg: C
         return _coast(state, frame, note, Status.LOST, cfg, tracked)
     details = _info(tracked)._replace(found=found, submap=place.state.active, keyframe=found == "nowhere")
     record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
-    held = Held(place.covariance, NONE)
+    held = at(place.covariance, EXACT, np.eye(4))
     record = record._replace(held=held, depth=thumbnail(frame.depth, state.camera))
     return place.state._replace(records=(*state.records, record), trouble=1, motion=None)
 

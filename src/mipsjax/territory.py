@@ -12,7 +12,7 @@ from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, nearest, r
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
-from mipsjax.host.held import NONE, Held, Matrix, moved, positive
+from mipsjax.host.held import NONE, Matrix, at, difference, moved
 from mipsjax.links import chain_distances, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
@@ -195,7 +195,7 @@ def _begin_here(state: SlamState, cfg: Config) -> SlamState:
 
 def _support(keyframe: Keyframe, anchor: Keyframe, T_new_old: Pose) -> Keyframe:
     """A keyframe of one submap in another that begins at a later one, `anchor`."""
-    since = positive(anchor.covariance - keyframe.covariance)
+    since = difference(anchor.covariance, keyframe.covariance)
     return keyframe._replace(T_sub_cam=T_new_old @ keyframe.T_sub_cam, covariance=moved(since, T_new_old))
 
 
@@ -216,7 +216,7 @@ def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
     """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
     own, last = state.submaps[place].keyframes[keyframe], state.records[-1]
     T_new_old = own.T_sub_cam @ inverse(last_pose(state))
-    held = Held(own.covariance, moved(last.held.motion, T_new_old))
+    held = at(own.covariance, last.held, T_new_old)
     last = last._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4), held=held)
     return activated(state, place)._replace(records=(*state.records[:-1], last))
 

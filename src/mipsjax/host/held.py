@@ -26,15 +26,19 @@ Pose = Float64[np.ndarray, "4 4"]
 class Held(NamedTuple):
     """How far the pose of one frame may be off in its submap."""
 
-    covariance: Matrix
-    """Relative to the submap's anchor."""
-    motion: Matrix
-    """Of the motion since the frame before, which the next one is expected to go on with."""
+    joint: Float64[np.ndarray, "12 12"]
+    """Of the pose, relative to the submap's anchor, and of the motion since the frame before, which the next frame is
+    expected to go on with."""
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of the pose."""
+        return self.joint[:6, :6]
 
 
 NONE = np.zeros((6, 6))
 """The covariance of an anchor, which is where it is by definition."""
-EXACT = Held(NONE, NONE)
+EXACT = Held(np.zeros((12, 12)))
 
 
 class Directions(NamedTuple):
@@ -56,23 +60,28 @@ def directions(information: Matrix) -> Directions:
 def held(
     reference: Matrix, last: Held, T_sub_cam: Pose, information: Matrix, seconds: float, cfg: HeldConfig
 ) -> Held:
-    """After a frame that was tracked at `T_sub_cam`, `seconds` after the last one.
+    """After a frame that was tracked at `T_sub_cam`, `seconds` after the last one: a step of a Kalman filter.
 
     It was measured against keyframes that are themselves off by `reference`, with the `information` of a twist in the
-    camera's frame. Where that says little the frame goes on as the last one did, give or take an acceleration.
+    camera's frame. Where that says little the frame goes on as the last one did, give or take an acceleration, and what
+    it is off by then grows ever faster.
     """
-    accelerated = np.repeat([cfg.acceleration, cfg.turn], 3) * seconds**2
+    accelerated = moved(np.diag(np.repeat([cfg.acceleration, cfg.turn], 3) ** 2) * seconds**4, T_sub_cam)
+    # Relative to those keyframes: what is common to them and to the last frame is counted once
+    expected = _positive(last.joint - _padded(reference))
+    on = np.block([[np.eye(6), np.eye(6)], [NONE, np.eye(6)]])
+    expected = on @ expected @ on.T + np.tile(accelerated, (2, 2))
     back = adjoint(np.linalg.inv(T_sub_cam))
-    changed = last.motion + moved(np.diag(accelerated**2), T_sub_cam)
-    # Of the last frame relative to those keyframes: what is common to both is counted once
-    since = positive(last.covariance - reference)
-    expected = since + changed
     measured = back.T @ information @ back
-    left = np.linalg.inv(np.linalg.inv(expected) + measured)
-    share = left @ measured
-    rest = np.eye(6) - share
-    motion = rest @ changed @ rest.T + share @ (since + left) @ share.T
-    return Held(_even(reference + left), _even(motion))
+    gain = expected[:, :6] @ np.linalg.solve(np.eye(6) + measured @ expected[:6, :6], measured)
+    return Held(_even(expected - gain @ expected[:6] + _padded(reference)))
+
+
+def at(covariance: Matrix, last: Held, T_new_old: Pose) -> Held:
+    """Of a frame whose pose is known this well in another submap, and which moves on as it did in the last one."""
+    joint = _padded(covariance)
+    joint[6:, 6:] = moved(last.joint[6:, 6:], T_new_old)
+    return Held(joint)
 
 
 def adjoint(T_a_b: Pose) -> Matrix:
@@ -90,10 +99,9 @@ def moved(covariance: Matrix, T_a_b: Pose) -> Matrix:
     return out @ covariance @ out.T
 
 
-def positive(matrix: Matrix) -> Matrix:
-    """The nearest covariance: without its negative parts."""
-    values, vectors = np.linalg.eigh(_even(matrix))
-    return (vectors * np.maximum(values, 0)) @ vectors.T
+def difference(whole: Matrix, part: Matrix) -> Matrix:
+    """What was added to one covariance to make another of it; nothing in directions in which it is the lesser."""
+    return _positive(whole - part)
 
 
 def deviations(covariance: Matrix, T_sub_cam: Pose) -> tuple[float, float]:
@@ -109,5 +117,17 @@ def cross(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _even(matrix: Matrix) -> Matrix:
+def _padded(covariance: Matrix) -> Float64[np.ndarray, "12 12"]:
+    joint = np.zeros((12, 12))
+    joint[:6, :6] = covariance
+    return joint
+
+
+def _positive(matrix: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
+    """The nearest covariance: without its negative parts."""
+    values, vectors = np.linalg.eigh(_even(matrix))
+    return (vectors * np.maximum(values, 0)) @ vectors.T
+
+
+def _even(matrix: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
     return (matrix + matrix.T) / 2
