@@ -26,7 +26,8 @@ DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
 PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
-PROBE = 0.02  # metres by which the frame is moved for that: more than the noise of depth
+PROBE = 0.04  # metres by which the frame is moved for that: more than the noise of depth
+SURE = 2.0  # standard errors of that measurement by which the frame may be held less
 PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
 PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
@@ -171,7 +172,7 @@ def information(
 
     Normals are noisy: along a bare wall they seem to hold a frame that slides freely. Along the directions in which
     the normal equations are weakest it is therefore measured how distances change when the frame is moved: the product
-    of noisy normals and of a change that does not know of this noise has the right mean.
+    of noisy normals and of a change that does not know of this noise has the right mean. Its own noise is taken off.
     """
     variance = cfg.sensor.noise_floor**2
     on_map, on_views = map_rows(field, T, seen.points, "whole", cfg), None
@@ -190,12 +191,13 @@ def information(
         shift, turn = jnp.linalg.norm(direction[:3]), jnp.linalg.norm(direction[3:])
         size = PROBE / jnp.maximum(shift, PROBE_REACH * turn)
         (psi, errors), (psi_back, errors_back) = moved(size * direction), moved(-size * direction)
-        total = jnp.sum(on_map.weight * (on_map.jacobian @ direction) * (psi - psi_back))
+        each = [on_map.weight * (on_map.jacobian @ direction) * (psi - psi_back)]
         if on_views is not None and errors is not None and errors_back is not None:
             both = errors.mask & errors_back.mask
             change = both * (errors.distance - errors_back.distance)
-            total += jnp.sum(on_views.weight * (on_views.jacobian @ direction) * change)
-        return total / (2 * size)
+            each.append((on_views.weight * (on_views.jacobian @ direction) * change).reshape(-1))
+        strengths = jnp.concatenate(each) / (2 * size)
+        return jnp.sum(strengths) - SURE * jnp.linalg.norm(strengths)
 
     weakest = directions[:, :PROBED].T
     excess = strength[:PROBED] - jnp.maximum(jax.lax.map(measured, weakest), 0)
