@@ -262,6 +262,42 @@ def test_registration_says_how_firmly_the_surface_holds_the_frame(corner_map, fr
     assert corner.held > 10 * CFG.loop.held and wall.held < 0.2 * corner.held
 
 
+def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
+    """The normals of a noisy depth image point everywhere; the normal equations take that for a hold along the wall."""
+    wall = plane((0, 0, -1), -2.0, cfg=PLANE_CFG)
+    rng = np.random.default_rng(0)
+
+    def noisy():
+        return (2 + 0.004 * rng.standard_normal((CAMERA.height, CAMERA.width))).astype(np.float32)
+
+    views = Views(jnp.asarray(np.stack([noisy()] * 2)), jnp.tile(jnp.eye(4), (2, 1, 1)))
+    seen = tracking.draw_points(KEY, noisy(), np.zeros((*frame[0].shape, 3), np.uint8), 2304, CAMERA)
+    p_sub = np.asarray(seen.p_cam)
+    evidence = solvers.Evidence(seen, views, landmarks_of(np.eye(4), p_sub))
+    T = jnp.eye(4)
+    found = jax.jit(lambda: solvers.information(wall, T, evidence, CAMERA, PLANE_CFG))()
+    surfaces, corners = (np.asarray(part) * PLANE_CFG.sensor.noise_floor**2 for part in found)
+    system = jax.jit(lambda: solvers.systems(wall, T, evidence, "whole", CAMERA, PLANE_CFG))()[0]
+    # Two shifts along the wall and a turn about its normal are free
+    assert np.linalg.eigvalsh(surfaces)[2] < 0.1 * np.linalg.eigvalsh(system.hessian)[2]
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(surfaces)[3:], np.linalg.eigvalsh(system.hessian)[3:], rtol=0.1
+    )
+    assert np.linalg.eigvalsh(surfaces + corners)[0] > 10 * np.linalg.eigvalsh(system.hessian)[0]
+
+
+def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, points):
+    away = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.03, 0, 0)), jnp.float32)
+
+    def end(points):
+        evidence = solvers.Evidence(points, expected=away)
+        start = jnp.asarray(TRUTH, jnp.float32)
+        return solvers.levenberg_marquardt(corner_map.field, start, evidence, "whole", 10, CAMERA, CFG)
+
+    nothing = points._replace(mask=jnp.zeros_like(points.mask))
+    assert apart(end(nothing), away)[0] < 1e-4 and apart(end(points), TRUTH)[0] < TOLERANCE_M
+
+
 def test_what_no_keyframe_observed_does_not_count_in_registration(corner_map, frame):
     """The submap's keyframe saw the left half; the right half of the frame shows a wall moved by what it made up."""
     depth, _ = frame

@@ -209,7 +209,8 @@ def information(
 
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
     """The points' distances to the surface in the depth image of each of K keyframes."""
-    go, precision, errors = cfg.track.go, precisions(points, cfg), _view_errors(T, points, views, camera)
+    go, precision = cfg.track.go, precisions(points, cfg)[None]
+    errors = _view_errors(T, points, views, camera)
     weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / go.view_robust) ** 2)
     # A point that falls on nothing costs as much as one that is as far off as is allowed
     off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
