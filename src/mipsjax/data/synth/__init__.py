@@ -27,11 +27,7 @@ def open_synth(name: str, frames: slice, input: InputConfig) -> SynthSequence:
     """
     base, *suffixes = name.split("+")
     spec = find(base)
-    if (
-        spec is None
-        or not set(suffixes) <= set(Degradations._fields)
-        or len(set(suffixes)) < len(suffixes)
-    ):
+    if spec is None or not set(suffixes) <= set(Degradations._fields) or len(set(suffixes)) < len(suffixes):
         raise InputError(
             f"synth:{name}: no such sequence; choose one of {', '.join(synth_names())} "
             "(SEED: a whole number from 0, as in home-7), with +noise or +blur or both behind it"

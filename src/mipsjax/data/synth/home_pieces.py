@@ -63,7 +63,7 @@ def things(use: str, draws: Draws) -> list[Thing]:
             chosen = [_picture, _narrow, _narrow]
     clutter = [] if use == "corridor" else [_crates, _ball, _stool, _radiator]
     wall = [_picture] * draws.pick((0, 1, 2, 3))
-    return [make(draws) for make in (*chosen, *draws.shuffled(clutter)[:2], *wall)]
+    return [make(draws) for make in (*chosen, *draws.shuffled(clutter)[:3], *wall)]
 
 
 def pendant(height: float, material: str) -> Piece:

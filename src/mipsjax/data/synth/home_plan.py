@@ -134,7 +134,7 @@ def _layout(count: int, draws: Draws, even: bool) -> tuple[list[Cell], Cell | No
     """Rooms on both sides of a corridor, or without one; `even` makes rooms of one size."""
     axis = draws.pick((0, 1))
     if count < 3 or draws.chance(0.15 if count > 4 else 0.4):
-        area = count * draws.between(13.0, 19.0)
+        area = draws.between(17.0, 24.0) if count == 1 else count * draws.between(13.0, 19.0)
         across = round((area / draws.between(1.0, 1.6)) ** 0.5, 2)
         return _divided(_cell(axis, 0.0, 0.0, area / across, across), count, draws, even), None
     length = (count + 1) // 2 * draws.between(3.3, 4.4)
@@ -149,8 +149,8 @@ def _layout(count: int, draws: Draws, even: bool) -> tuple[list[Cell], Cell | No
 
 def _cell(axis: int, along: float, across: float, length: float, depth: float) -> Cell:
     """A rectangle of that length along an axis and that depth along the other."""
-    low, high = (along, across), (round(along + length, 2), round(across + depth, 2))
-    return Cell(low, high) if axis == 0 else Cell(low[::-1], high[::-1])
+    end, far = round(along + length, 2), round(across + depth, 2)
+    return Cell((along, across), (end, far)) if axis == 0 else Cell((across, along), (far, end))
 
 
 def _divided(cell: Cell, count: int, draws: Draws, even: bool) -> list[Cell]:
@@ -189,7 +189,9 @@ def _rooms(seed: int, cells: list[Cell], draws: Draws, twins: bool) -> tuple[Roo
         first, second = min(combinations(order[1:], 2), key=lambda pair: _unlike(cells, *pair))
         uses[second], styles[second] = uses[first], first
     return tuple(
-        Room(cell, uses[row], styles[row], _room_hub(cell, stream(seed, _STYLE, styles[row], 0)))
+        Room(
+            cell, uses[row], styles[row], _room_hub(cell, len(cells) == 1, stream(seed, _STYLE, styles[row]))
+        )
         for row, cell in enumerate(cells)
     )
 
@@ -198,12 +200,15 @@ def _unlike(cells: list[Cell], first: int, second: int) -> float:
     return sum(abs(cells[first].side(axis) - cells[second].side(axis)) for axis in (0, 1))
 
 
-def _room_hub(cell: Cell, draws: Draws) -> Hub:
-    """A loop that leaves room for furniture along the walls, longer in a longer room."""
+def _room_hub(cell: Cell, alone: bool, draws: Draws) -> Hub:
+    """A loop that leaves room for furniture along the walls, longer in a longer room.
+
+    In the only room of a home it is wider: there one goes round and round, and the camera with one.
+    """
     axis = 0 if cell.side(0) >= cell.side(1) else 1
-    radius = 0.5 if cell.side(1 - axis) < 4.0 else draws.between(0.5, 0.7)
+    radius = 0.75 if alone else 0.5 if cell.side(1 - axis) < 4.0 else draws.between(0.5, 0.7)
     spare = [cell.side(a) / 2 - radius - CLEAR - 0.1 for a in (0, 1)]
-    reach = max(0.0, spare[axis] - 0.6) * draws.between(0.2, 0.8)
+    reach = max(0.1 if alone else 0.0, (spare[axis] - 0.6) * draws.between(0.2, 0.8))
     shift = [0.6 * draws.between(-1.0, 1.0) * (spare[a] - (reach if a == axis else 0.0)) for a in (0, 1)]
     center = [cell.middle()[a] + shift[a] for a in (0, 1)]
     ends = [tuple(center[a] + sign * (reach if a == axis else 0.0) for a in (0, 1)) for sign in (-1, 1)]
@@ -273,7 +278,5 @@ def _windows(rooms: tuple[Room, ...], draws: Draws) -> tuple[Window, ...]:
                 along = round(room.cell.middle()[1 - axis] + draws.between(-1.0, 1.0) * slack, 3)
                 place = (end[axis], along) if axis == 0 else (along, end[axis])
                 sill = draws.between(0.85, 1.0)
-                found.append(
-                    Window(number, place, axis, outward, width, sill, draws.between(1.05, 1.3))
-                )
+                found.append(Window(number, place, axis, outward, width, sill, draws.between(1.05, 1.3)))
     return tuple(found)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from mipsjax.data.synth.draws import Draws
 from mipsjax.data.synth.home_plan import Door, Plan, Room, stream
 from mipsjax.data.synth.home_ways import Line, approach, ring
 
@@ -13,7 +12,8 @@ STEP = 0.05
 """Metres between the points of a route."""
 # Second word of the stream; see `stream`
 _ROUTE = 5
-# Corners are rounded by a Gaussian of this standard deviation, metres: little enough to stay clear of all things
+# Corners are rounded by a Gaussian of this standard deviation, metres: little enough to
+# stay clear of all things
 _CORNER = 0.15
 # Rounds in a home of one room
 _LAPS = 3
@@ -23,30 +23,32 @@ _SHARE = 0.75
 
 def route(plan: Plan) -> Line:
     """Points `STEP` apart on the way through all rooms. That of a plan that `returns` is closed."""
-    draws = stream(plan.seed, _ROUTE)
-    order = room_order(plan, draws)
-    parts = [_ends(plan, order, draws, at_start=True)] if not plan.returns else []
-    seen = {order[0]}
+    order = room_order(plan)
+    if len(order) == 1:
+        return _even(np.concatenate([ring(plan.rooms[0].hub)] * _LAPS), plan.returns)
+    parts, seen = list[Line](), {order[0]}
     for before, here, after in zip(order, order[1:], order[2:], strict=False):
         doors = _door(plan, before, here), _door(plan, here, after)
         parts.append(_passage(plan.rooms[here], *doors, long=here not in seen))
         seen.add(here)
-    if len(order) == 1:
-        parts = [ring(plan.rooms[0].hub)] * _LAPS
-    elif plan.returns:
+    if plan.returns:
         doors = _door(plan, order[-2], order[0]), _door(plan, order[0], order[1])
-        parts.append(_passage(plan.rooms[order[0]], *doors, long=True))
+        last = _passage(plan.rooms[order[0]], *doors, long=True)
+        parts = [last[len(last) // 2 :], *parts, last[: len(last) // 2]]
     else:
-        parts.append(_ends(plan, order, draws, at_start=False))
+        sides = stream(plan.seed, _ROUTE, 1)
+        begin = _stay(plan, order[0], order[1], sides.pick((1, -1)))
+        parts = [begin[::-1], *parts, _stay(plan, order[-1], order[-2], sides.pick((1, -1)))]
     return _even(np.concatenate(parts), plan.returns)
 
 
-def room_order(plan: Plan, draws: Draws) -> list[int]:
+def room_order(plan: Plan) -> list[int]:
     """Rooms as they are entered, neighbours joined by a door; from the last back to the first if it `returns`.
 
     Always on to one of the nearest rooms that have not been seen.
     """
-    order = [draws.pick([n for n, room in enumerate(plan.rooms) if room.use != "corridor"])]
+    rooms = [number for number, room in enumerate(plan.rooms) if room.use != "corridor"]
+    order = [stream(plan.seed, _ROUTE, 0).pick(rooms)]
     unseen = set(range(len(plan.rooms))) - set(order)
     while unseen:
         found = _shortest(plan, order, unseen)
@@ -97,20 +99,14 @@ def _passage(room: Room, entry: Door, leave: Door, *, long: bool) -> Line:
     return np.concatenate(chosen)
 
 
-def _ends(plan: Plan, order: list[int], draws: Draws, *, at_start: bool) -> Line:
-    """The part of the loop where an open walk begins or ends."""
-    if len(order) == 1:
-        return np.zeros((0, 2))
-    here, other = (order[0], order[1]) if at_start else (order[-1], order[-2])
-    room, door = plan.rooms[here], _door(plan, here, other)
-    there, meet = approach(room, door, side := draws.pick((1, -1)))
+def _stay(plan: Plan, here: int, other: int, side: int) -> Line:
+    """From the door of another room into one, and round it: where an open walk ends, or begins backwards."""
+    room = plan.rooms[here]
+    there, meet = approach(room, _door(plan, here, other), side)
     loop = ring(room.hub)
     if room.hub.radius == 0.0:
-        rest = loop[meet:] if len(loop) - meet > meet else loop[meet::-1]
-    else:
-        rest = _along(loop, meet, meet + side * round(_SHARE * len(loop)), side)
-    line = np.concatenate([there, rest])
-    return line[::-1] if at_start else line
+        return np.concatenate([there, loop[meet:] if len(loop) > 2 * meet else loop[meet::-1]])
+    return np.concatenate([there, _along(loop, meet, meet + side * round(_SHARE * len(loop)), side)])
 
 
 def _along(loop: Line, first: int, last: int, side: int) -> Line:

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from scipy.ndimage import gaussian_filter1d
 
 from mipsjax.data.synth.build import Vector
@@ -69,7 +69,11 @@ def home_walk(seed: int, tempo: Tempo) -> CameraPath:
     count = round(STEP * len(line) / _KNOTS_M)
     at = np.arange(count) * len(line) / count if plan.returns else np.linspace(0, len(line) - 1, count)
     along = STEP * np.arange(len(line))
-    height = draws.between(1.35, 1.55) + _SWAY * np.sin(_waves(along, _SWAY_M)) + _BOB * np.sin(_waves(along, _STRIDE_M))
+    height = (
+        draws.between(1.35, 1.55)
+        + _SWAY * np.sin(_waves(along, _SWAY_M))
+        + _BOB * np.sin(_waves(along, _STRIDE_M))
+    )
     places = np.stack([line[:, 0], -height, line[:, 1]], axis=1)
     sight = np.stack([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)], axis=1)
     rows = np.round(at).astype(int)
@@ -126,9 +130,7 @@ def _sights(plan: Plan, number: int) -> list[Vector]:
 
 def _room_at(plan: Plan, place: Float64[np.ndarray, "2"]) -> int:
     """The room nearest to a place."""
-    gaps = [
-        float(np.max(np.maximum(room.cell.low - place, place - room.cell.high))) for room in plan.rooms
-    ]
+    gaps = [float(np.max(np.maximum(room.cell.low - place, place - room.cell.high))) for room in plan.rooms]
     return int(np.argmin(gaps))
 
 
@@ -155,8 +157,7 @@ def _steadied(angle: Samples, slope: float, closed: bool) -> Samples:
     if closed:
         turns = 2.0 * np.pi * np.round((angle[-1] - angle[0]) / (2.0 * np.pi))
         angle = np.concatenate([angle - turns, angle, angle + turns])
-    apart = slope * STEP * np.abs(np.arange(len(angle))[:, None] - np.arange(len(angle))[None])
-    bounded = 0.5 * (np.min(angle + apart, axis=1) + np.max(angle - apart, axis=1))
+    bounded = 0.5 * (_below(angle, slope * STEP) - _below(-angle, slope * STEP))
     smooth = gaussian_filter1d(bounded, _SMOOTH / STEP, mode="nearest")
     return smooth[count : 2 * count] if closed else smooth
 
@@ -165,6 +166,13 @@ def _pace(yaw: Samples, pitch: Samples, tempo: Tempo) -> Samples:
     """Speeds along a line, metres a second: slow in time before the camera turns much."""
     turn = np.hypot(np.gradient(yaw), np.gradient(pitch)) / STEP
     wished = np.clip(tempo.turning / np.maximum(turn, 1e-6), *tempo.limits.linear)
-    # v^2 changes by 2 a a metre
-    apart = 2.0 * tempo.acceleration * STEP * np.abs(np.arange(len(turn))[:, None] - np.arange(len(turn))[None])
-    return np.sqrt(np.min(wished**2 + apart, axis=1))
+    # At an acceleration a the square of the speed changes by 2 a in a metre
+    return np.sqrt(_below(wished**2, 2.0 * tempo.acceleration * STEP))
+
+
+def _below(values: Samples, rise: float) -> Samples:
+    """The greatest values that are nowhere above the given ones and differ by at most `rise` from the next."""
+    ramp = rise * np.arange(len(values))
+    forward = np.minimum.accumulate(values - ramp) + ramp
+    backward = np.minimum.accumulate((values + ramp)[::-1])[::-1] - ramp
+    return np.minimum(forward, backward)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from mipsjax.data.synth.build import Place
 from mipsjax.data.synth.home_plan import CLEAR, WALL, Door, Hub, Plan, Room
 
 # Metres between points of a line
@@ -25,11 +27,14 @@ class Ways(NamedTuple):
     places: Line
     clear: Float64[np.ndarray, "N"]
 
+    def moved(self, offset: Place) -> Ways:
+        return Ways(self.places + np.array(offset), self.clear)
+
 
 def line(*corners: tuple[float, float] | Float64[np.ndarray, "2"]) -> Line:
     """Straight from corner to corner in steps of about 5 cm."""
     parts = [np.array(corners[:1], np.float64)]
-    for start, stop in zip(corners, corners[1:], strict=False):
+    for start, stop in pairwise(corners):
         count = max(1, round(float(np.hypot(*np.subtract(stop, start))) / _STEP))
         share = np.arange(1, count + 1)[:, None] / count
         parts.append((1.0 - share) * np.array(start) + share * np.array(stop))

@@ -31,7 +31,7 @@ def _plain(red: float, green: float, blue: float) -> Paint:
 
 
 PLAIN_WALLS = ("chalk", "cream", "dove", "sage", "blush", "petrol")
-WALLS = ("plaster", "mint", "rose", "sand", "sky", "wallpaper", "checked")
+WALLS = ("plaster", "sky", "roughcast", "lime", "wallpaper", "checked", "clouded")
 FLOORS = ("parquet", "boards", "tiles", "slabs", "carpet", "felt", "linoleum")
 
 HOME_PAINTS: dict[str, Paint] = {
@@ -44,6 +44,9 @@ HOME_PAINTS: dict[str, Paint] = {
     "petrol": _plain(0.16, 0.34, 0.38),
     "wallpaper": Paint((0.44, 0.46, 0.60), (0.72, 0.72, 0.78), (3.0, 3.0, 3.0), (0.5, 0.5, 0.0, 0.0, 0.0)),
     "checked": Paint((0.60, 0.52, 0.38), (0.80, 0.74, 0.60), (1.5, 1.5, 1.5), (0.5, 0.5, 0.0, 0.0, 0.0)),
+    "roughcast": Paint((0.60, 0.57, 0.52), (0.78, 0.76, 0.72), (6.0, 6.0, 6.0), _NOISE),
+    "lime": Paint((0.52, 0.60, 0.44), (0.64, 0.70, 0.54), (3.0, 3.0, 3.0), _NOISE),
+    "clouded": Paint((0.62, 0.46, 0.38), (0.76, 0.60, 0.50), (2.0, 2.0, 2.0), _NOISE),
     "boards": Paint((0.40, 0.28, 0.16), (0.68, 0.52, 0.34), (4.0, 1.0, 0.8), _BOARDS),
     "slabs": Paint((0.22, 0.20, 0.19), (0.44, 0.42, 0.40), (1.0, 0.0, 1.0), _CHECKS),
     "felt": Paint((0.34, 0.22, 0.18), (0.56, 0.42, 0.36), (5.0, 5.0, 5.0), _NOISE),
