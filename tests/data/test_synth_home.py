@@ -1,19 +1,16 @@
-"""Homes drawn from a seed: what every one of them must be, by plan and path alone, and a few rendered."""
+"""Homes drawn from a seed: what every one of them must be, by plan and path alone."""
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mipsjax.config import InputConfig
 from mipsjax.data.synth import open_synth, synth_names
-from mipsjax.data.synth.__main__ import main
 from mipsjax.data.synth.catalog import Spec, find
 from mipsjax.data.synth.draws import Draws
 from mipsjax.data.synth.home import home
@@ -21,18 +18,14 @@ from mipsjax.data.synth.home_furnish import furnished, outside
 from mipsjax.data.synth.home_plan import MOST_ROOMS, WALL, Plan, home_plan
 from mipsjax.data.synth.home_route import room_order, route
 from mipsjax.data.synth.home_walk import FAST, SLOW, Tempo
-from mipsjax.data.synth.mesh import reference_mesh
 from mipsjax.data.synth.path import speeds
 from mipsjax.errors import InputError
 
 SEEDS = range(101, 161)
 # Poses are checked so many times a second
 OFTEN = 60.0
-# A home of one room and of few shapes, and one of several rooms with windows
-SMALL_HOME, LARGE_HOME = 106, 105
-NARROW = InputConfig(working_width=80)
-
-distance = jax.jit(lambda scene, points: scene.distance(points))
+# A home of several rooms, two of them alike
+LARGE_HOME = 105
 
 
 def spec(seed: int, tempo: Tempo) -> Spec:
@@ -158,62 +151,14 @@ def test_a_seed_gives_the_same_bits_again() -> None:
     np.testing.assert_array_equal(before[1].center, home(LARGE_HOME).boxes.center)
 
 
+def test_plans_are_the_same_with_every_version() -> None:
+    """Only sums, products and square roots make a plan: nothing that a library may round in another way."""
+    text = repr([home_plan(seed) for seed in SEEDS[:20]])
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "107a8a9645999b78"
+
+
 def test_great_seeds_have_homes() -> None:
     assert home_plan(10**18 - 1).room_count() >= 1 and home_plan(0) != home_plan(10**18 - 1)
-
-
-# Images
-
-
-@pytest.mark.parametrize("name", [f"home-{SMALL_HOME}", f"home-{LARGE_HOME}-fast"])
-def test_most_pixels_have_depth_and_the_camera_is_in_free_space(name: str) -> None:
-    sequence = open_synth(name, slice(None, None, 60), NARROW)
-    assert sequence.T_world_cam is not None
-    free = distance(sequence.scene, jnp.asarray(sequence.T_world_cam[:, :3, 3], jnp.float32))
-    assert np.min(free) > 0.25
-    measured = []
-    for number in range(len(sequence)):
-        frame = sequence[number]
-        assert frame.depth is not None and frame.color is not None
-        measured.append(np.mean(frame.depth > 0.0))
-        assert frame.color.std() > 5.0
-    assert np.median(measured) > 0.9 and np.quantile(measured, 0.1) > 0.6
-    # Glass: some frames lack depth, and are bright there
-    assert np.min(measured) < 0.99
-
-
-def test_glass_has_no_depth_and_is_bright() -> None:
-    """Towards the middle of a window, from 1.5 m."""
-    from mipsjax.data.synth.catalog import QVGA
-    from mipsjax.data.synth.render import render
-
-    plan = home_plan(SMALL_HOME)
-    window = plan.windows[0]
-    forward = np.zeros(3)
-    forward[[0, 2][window.axis]] = window.outward
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    T_world_cam = np.eye(4)
-    T_world_cam[:3, :3] = np.stack([right, [0.0, 1.0, 0.0], forward], axis=1)
-    middle = np.array([window.place[0], -(window.sill + window.height / 2), window.place[1]])
-    # Beside the bar in the middle
-    T_world_cam[:3, 3] = middle - 1.5 * forward + 0.25 * window.width * right
-    image = render(home(SMALL_HOME), QVGA.resized(80, 60), T_world_cam[None])
-    assert image.glass[30, 40] and not image.glass[58, 40]
-    assert image.color[image.glass].mean() > 1.2 * image.color[~image.glass].mean()
-    # The pane ends the ray: its own depth is known to the renderer
-    assert image.depth[30, 40] == pytest.approx(1.7, abs=0.03)
-
-
-def test_noise_and_blur_take_glass() -> None:
-    sequence = open_synth(f"home-{SMALL_HOME}-fast+noise+blur", slice(40, 41), NARROW)
-    frame = sequence[0]
-    assert frame.depth is not None and frame.depth.max() < 6.5
-
-
-def test_the_true_mesh_is_made(tmp_path: Path) -> None:
-    mesh = reference_mesh(home(SMALL_HOME), voxel_m=0.12)
-    off = np.abs(distance(home(SMALL_HOME), jnp.asarray(mesh.vertices, jnp.float32)))
-    assert np.quantile(off, 0.98) < 1e-4
 
 
 # Names
@@ -241,10 +186,3 @@ def test_wrong_names_are_answered_with_the_form(name: str) -> None:
     with pytest.raises(InputError, match="home-SEED") as error:
         open_synth(name, slice(None), InputConfig())
     assert "\n" not in str(error.value)
-
-
-def test_export_of_a_home(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    name = f"home-{SMALL_HOME}"
-    assert main([name, str(tmp_path / "home"), "--frames", ":2", "--no-mesh"]) == 0
-    assert f"2 frames of synth:{name}" in capsys.readouterr().out
-    assert '"fps": 15.0' in (tmp_path / "home" / "camera.json").read_text()
