@@ -15,7 +15,8 @@ from mipsjax.data.synth.catalog import Spec, find
 from mipsjax.data.synth.draws import Draws
 from mipsjax.data.synth.home import home
 from mipsjax.data.synth.home_furnish import furnished, outside
-from mipsjax.data.synth.home_plan import MOST_ROOMS, WALL, Plan, home_plan
+from mipsjax.data.synth.home_layout import WALL
+from mipsjax.data.synth.home_plan import MOST_ROOMS, Plan, home_plan
 from mipsjax.data.synth.home_route import room_order, route
 from mipsjax.data.synth.home_walk import FAST, SLOW, Tempo
 from mipsjax.data.synth.path import speeds

@@ -7,7 +7,8 @@ from functools import lru_cache
 from mipsjax.data.synth.build import RGB, Solid, Vector, assemble, block, hollow
 from mipsjax.data.synth.furniture import Piece, casing, together
 from mipsjax.data.synth.home_furnish import DOOR_HEIGHT, furnished
-from mipsjax.data.synth.home_plan import MOST_ROOMS, WALL, Door, Plan, Room, Window, home_plan, stream
+from mipsjax.data.synth.home_layout import WALL
+from mipsjax.data.synth.home_plan import MOST_ROOMS, Door, Plan, Room, Window, home_plan, stream
 from mipsjax.data.synth.paints import FLOORS, GLOWS, HOME_PAINTS, PLAIN_WALLS, WALLS
 from mipsjax.data.synth.scene import Scene
 

@@ -12,8 +12,8 @@ STEP = 0.05
 """Metres between the points of a route."""
 # Second word of the stream; see `stream`
 _ROUTE = 5
-# Corners are rounded by a Gaussian of this standard deviation, metres: little enough to
-# stay clear of all things
+# Corners are rounded by a Gaussian of this standard deviation, metres: little enough to stay clear
+# of all things
 _CORNER = 0.15
 # Rounds in a home of one room
 _LAPS = 3

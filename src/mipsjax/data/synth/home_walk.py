@@ -68,12 +68,7 @@ def home_walk(seed: int, tempo: Tempo) -> CameraPath:
     pace = _pace(yaw, pitch, tempo)
     count = round(STEP * len(line) / _KNOTS_M)
     at = np.arange(count) * len(line) / count if plan.returns else np.linspace(0, len(line) - 1, count)
-    along = STEP * np.arange(len(line))
-    height = (
-        draws.between(1.35, 1.55)
-        + _SWAY * np.sin(_waves(along, _SWAY_M))
-        + _BOB * np.sin(_waves(along, _STRIDE_M))
-    )
+    height = draws.between(1.35, 1.55) + _bob(STEP * np.arange(len(line)))
     places = np.stack([line[:, 0], -height, line[:, 1]], axis=1)
     sight = np.stack([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)], axis=1)
     rows = np.round(at).astype(int)
@@ -85,6 +80,11 @@ def home_walk(seed: int, tempo: Tempo) -> CameraPath:
         closed=plan.returns,
         roll_deg=_ROLL_DEG,
     )
+
+
+def _bob(along: Samples) -> Samples:
+    """How a hand goes up and down, metres."""
+    return _SWAY * np.sin(_waves(along, _SWAY_M)) + _BOB * np.sin(_waves(along, _STRIDE_M))
 
 
 def _waves(along: Samples, every_m: float) -> Samples:

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.data.synth.build import Place
-from mipsjax.data.synth.home_plan import CLEAR, WALL, Door, Hub, Plan, Room
+from mipsjax.data.synth.home_layout import WALL
+from mipsjax.data.synth.home_plan import CLEAR, Door, Hub, Plan, Room
 
 # Metres between points of a line
 _STEP = 0.05
