@@ -17,6 +17,7 @@ from mipsjax.data.synth.home import home
 from mipsjax.data.synth.home_plan import home_plan
 from mipsjax.data.synth.mesh import reference_mesh
 from mipsjax.data.synth.render import render
+from mipsjax.host.surface import Views, observed
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +62,24 @@ def test_glass_has_no_depth_and_is_bright() -> None:
     assert image.color[image.glass].mean() > 1.2 * image.color[~image.glass].mean()
     # The pane ends the ray: its own depth is known to the renderer
     assert image.depth[30, 40] == pytest.approx(1.7, abs=0.03)
+
+
+def test_glass_is_no_part_of_what_was_seen() -> None:
+    """So that the true mesh, culled to that, holds no panes; the middles of the wall below them are seen."""
+    sequence = open_synth(f"home-{SMALL_HOME}", slice(None, None, 30), NARROW)
+    assert sequence.T_world_cam is not None
+    panes, walls = [], []
+    for window in home_plan(SMALL_HOME).windows:
+        across, along = (0, 2) if window.axis == 0 else (2, 0)
+        point = np.array([window.place[0], -(window.sill + 0.5 * window.height), window.place[1]])
+        point[along] += 0.25 * window.width
+        walls.append(np.array([point[0], -0.8 * window.sill, point[2]]))
+        point[across] += 0.19 * window.outward
+        panes.append(point)
+    depths = [frame.depth for frame in (sequence[n] for n in range(len(sequence))) if frame.depth is not None]
+    views = Views(sequence.T_world_cam, sequence.intrinsics, depths)
+    assert not observed(np.array(panes), views).any()
+    assert observed(np.array(walls), views).any()
 
 
 def test_noise_and_blur_take_glass() -> None:
