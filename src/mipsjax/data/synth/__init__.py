@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mipsjax.config import InputConfig
-from mipsjax.data.synth.catalog import SPECS
+from mipsjax.data.synth.catalog import HOMES, SPECS, find
 from mipsjax.data.synth.sequence import Degradations, SynthSequence
 from mipsjax.errors import InputError
 
@@ -11,8 +11,11 @@ __all__ = ["Degradations", "SynthSequence", "open_synth", "synth_names"]
 
 
 def synth_names() -> dict[str, str]:
-    """Every sequence, with a line about it; each also takes `+noise` and `+blur` at the end of its name."""
-    return {name: spec.about for name, spec in SPECS.items()}
+    """Every sequence, with a line about it; each also takes `+noise` and `+blur` at the end of its name.
+
+    A name with SEED in it stands for those of all whole numbers there.
+    """
+    return {name: spec.about for name, spec in SPECS.items()} | HOMES
 
 
 def open_synth(name: str, frames: slice, input: InputConfig) -> SynthSequence:
@@ -23,16 +26,12 @@ def open_synth(name: str, frames: slice, input: InputConfig) -> SynthSequence:
     for empty selections.
     """
     base, *suffixes = name.split("+")
-    if (
-        base not in SPECS
-        or not set(suffixes) <= set(Degradations._fields)
-        or len(set(suffixes)) < len(suffixes)
-    ):
+    spec = find(base)
+    if spec is None or not set(suffixes) <= set(Degradations._fields) or len(set(suffixes)) < len(suffixes):
         raise InputError(
-            f"synth:{name}: no such sequence; choose one of {', '.join(SPECS)}, "
-            "with +noise or +blur or both behind it"
+            f"synth:{name}: no such sequence; choose one of {', '.join(synth_names())} "
+            "(SEED: a whole number from 0, as in home-7), with +noise or +blur or both behind it"
         )
-    spec = SPECS[base]
     indices = range(spec.frames)[frames]
     if len(indices) == 0 or indices.step < 0:
         raise InputError(

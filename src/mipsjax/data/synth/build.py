@@ -97,10 +97,12 @@ def assemble(
     boxes: Sequence[Solid],
     cylinders: Sequence[Solid],
     lights: Sequence[tuple[Vector, RGB]],
+    glows: Mapping[str, float] | None = None,
 ) -> Scene:
     """The scene of these solids, with materials named as in `paints`.
 
-    `lights` are pairs of position (x, height, z) and colour. At least one solid must be carved.
+    `lights` are pairs of position (x, height, z) and colour, `glows` the light that shines through those
+    materials which are glass. At least one solid must be carved.
     """
     low = np.min([np.subtract(solid.center, solid.half) for solid in carved], axis=0)
     high = np.max([np.add(solid.center, solid.half) for solid in carved], axis=0)
@@ -115,6 +117,7 @@ def assemble(
             materials=Materials(*(_floats(column) for column in zip(*paints.values(), strict=True))),
             lights=Lights(_floats(position), _floats(color)),
             bounds=_floats([low, high]),
+            glow=_floats([glows.get(name, 0.0) for name in paints]) if glows else None,
         )
 
 

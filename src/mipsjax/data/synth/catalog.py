@@ -1,9 +1,13 @@
-"""The built-in sequences by name: a scene, a camera path through it, and an image size."""
+"""The built-in sequences by name: a scene, a camera path through it, and an image size.
+
+Besides those of `SPECS` there is one for every whole number: `home-SEED`, and `home-SEED-fast`.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,13 +15,15 @@ import numpy as np
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.synth.apartment import WALK, apartment
 from mipsjax.data.synth.corridors import RING, STAIR, corridor_loop, winding_corridor
+from mipsjax.data.synth.home import home
+from mipsjax.data.synth.home_walk import FAST, SLOW, home_walk
 from mipsjax.data.synth.path import CameraPath, SpeedLimits, spline_path
 from mipsjax.data.synth.rooms import living_room
 from mipsjax.data.synth.scene import Scene
 from mipsjax.data.synth.walk import Gait, walk
 
 FPS = 30.0
-"""Frames a second of every sequence."""
+"""Frames a second, unless a sequence says otherwise."""
 
 # A field of view of 62.7 x 49.1 degrees, as the usual structured-light cameras have
 QVGA = Intrinsics(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
@@ -30,9 +36,11 @@ class Spec(NamedTuple):
     path: Callable[[], CameraPath]
     intrinsics: Intrinsics
     frames: int
-    """Number of frames at `FPS` from the start of the path."""
+    """Number of frames from the start of the path."""
     about: str
     """One line for a user who chooses."""
+    fps: float = FPS
+    """Frames a second."""
 
 
 @lru_cache(maxsize=1)
@@ -124,3 +132,36 @@ SPECS: dict[str, Spec] = {
         "corridor of four legs that look alike, 42 m, 1.2 m/s, no return",
     ),
 }
+
+HOMES: dict[str, str] = {
+    "home-SEED": "a furnished home of one to eight rooms drawn from SEED, a whole number: 0.4 to 1 m/s, 15 Hz",
+    "home-SEED-fast": "the same home and walk at 1 to 4 m/s, 30 Hz",
+}
+"""Families of sequences by the form of their names, with a line about each."""
+# As many digits as are no nuisance in a file name
+_HOME = re.compile(r"home-(0|[1-9][0-9]{0,17})(-fast)?", re.ASCII)
+# Seconds for which a walk that has come back goes on
+_AGAIN_S = 1.0
+
+
+def find(name: str) -> Spec | None:
+    """The sequence of that name, or None."""
+    match = _HOME.fullmatch(name)
+    if match is None:
+        return SPECS.get(name)
+    return _home(int(match[1]), fast=match[2] is not None)
+
+
+@lru_cache(maxsize=8)
+def _home(seed: int, *, fast: bool) -> Spec:
+    tempo = FAST if fast else SLOW
+    path = home_walk(seed, tempo)
+    seconds = path.duration + _AGAIN_S if path.closed else path.duration
+    return Spec(
+        partial(home, seed),
+        lambda: path,
+        QVGA,
+        1 + int(seconds * tempo.fps),
+        HOMES["home-SEED-fast" if fast else "home-SEED"],
+        tempo.fps,
+    )

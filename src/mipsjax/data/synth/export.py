@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from mipsjax.data.sequence import Frame
-from mipsjax.data.synth.catalog import FPS
 from mipsjax.data.synth.mesh import reference_mesh
 from mipsjax.data.synth.sequence import SynthSequence
 from mipsjax.data.trajectory import write_tum
@@ -59,7 +58,7 @@ def _write_lists(folder: Path, sequence: SynthSequence) -> None:
         )
     assert sequence.T_world_cam is not None, "synthetic poses are known"
     write_tum(folder / "groundtruth.txt", sequence.timestamps, sequence.T_world_cam)
-    camera = {**sequence.intrinsics._asdict(), "depth_scale": DEPTH_UNITS_PER_METRE, "fps": FPS}
+    camera = {**sequence.intrinsics._asdict(), "depth_scale": DEPTH_UNITS_PER_METRE, "fps": sequence.fps}
     (folder / "camera.json").write_text(json.dumps(camera, indent=2) + "\n", encoding="ascii")
 
 

@@ -30,6 +30,8 @@ _TINY = 1e-9
 _GRAZING, _CORRECTION = 0.02, 5e-3
 # Distances from a surface (metres) at which what is around it shades it, and how much
 _AMBIENT_REACH = ((0.06, 0.45), (0.28, 0.4))
+# What is seen through glass is so far behind it, metres of z-depth
+_OUTSIDE = 6.0
 # Ambient light from below and from above, linear
 _AMBIENT_DOWN, _AMBIENT_UP = 0.22, 0.38
 # Display encoding of linear colour
@@ -59,6 +61,8 @@ class Image(NamedTuple):
     """RGB."""
     depth: Float32[np.ndarray, "H W"]
     """z-depth, metres."""
+    glass: Bool[np.ndarray, "H W"]
+    """Pixels that show the outside through glass, which a depth camera does not measure; depth is the glass's."""
 
 
 def render(scene: Scene, intrinsics: Intrinsics, T_world_cam: Float64[np.ndarray, "K 4 4"]) -> Image:
@@ -72,8 +76,9 @@ def render(scene: Scene, intrinsics: Intrinsics, T_world_cam: Float64[np.ndarray
         _view(in_view(scene, intrinsics, pose), jnp.asarray(pose, jnp.float32), pinhole, height, width)
         for pose in T_world_cam
     ]
-    light = np.mean([np.asarray(color) for color, _ in views], axis=0)
-    return Image(display(light), np.asarray(views[len(views) // 2][1]))
+    light = np.mean([np.asarray(color) for color, _, _ in views], axis=0)
+    _, depth, glass = views[len(views) // 2]
+    return Image(display(light), np.asarray(depth), np.asarray(glass))
 
 
 def display(light: Float[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
@@ -240,7 +245,11 @@ def radiance(scene: Scene, points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
 
 
 def _radiance(scene: Scene, surface: Surface, points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    return albedo(scene.materials, surface.material, points) * irradiance(scene, surface, points)
+    light = irradiance(scene, surface, points)
+    if scene.glow is not None:
+        glow = scene.glow[surface.material][:, None]
+        light = jnp.where(glow > 0.0, glow, light)
+    return albedo(scene.materials, surface.material, points) * light
 
 
 def _settle(surface: Surface, rays: Rays, depth: Float[Array, "N"]) -> Float[Array, "N"]:
@@ -253,10 +262,14 @@ def _settle(surface: Surface, rays: Rays, depth: Float[Array, "N"]) -> Float[Arr
 @partial(jax.jit, static_argnames=("height", "width"))
 def _view(
     scene: Scene, T_world_cam: Float[Array, "4 4"], pinhole: Float[Array, "4"], height: int, width: int
-) -> tuple[Float[Array, "H W 3"], Float[Array, "H W"]]:
+) -> tuple[Float[Array, "H W 3"], Float[Array, "H W"], Bool[Array, "H W"]]:
     rays = pixel_rays(T_world_cam, pinhole, height, width)
     hit = trace(scene, rays)
     surface = scene.surface(jnp.stack(rays.at(hit), axis=-1))
     depth = _settle(surface, rays, hit)
-    color = _radiance(scene, surface, jnp.stack(rays.at(depth), axis=-1))
-    return color.reshape(height, width, 3), depth.reshape(height, width)
+    glass, shown = jnp.zeros(depth.shape, bool), depth
+    if scene.glow is not None:
+        glass = scene.glow[surface.material] > 0.0
+        shown = depth + jnp.where(glass, _OUTSIDE, 0.0)
+    color = _radiance(scene, surface, jnp.stack(rays.at(shown), axis=-1))
+    return color.reshape(height, width, 3), depth.reshape(height, width), glass.reshape(height, width)

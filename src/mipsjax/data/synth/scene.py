@@ -86,6 +86,8 @@ class Scene(NamedTuple):
     lights: Lights
     bounds: Float[Array, "2 3"]
     """Lower and upper corner of a box that holds every visible surface, metres."""
+    glow: Float[Array, "M"] | None = None
+    """Light of the outside that shines through each material, 0 for what is no glass; None if nothing is."""
 
     def distance(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance in metres, positive in free space.

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
-from mipsjax.data.synth.catalog import FPS, Spec
+from mipsjax.data.synth.catalog import Spec
 from mipsjax.data.synth.render import render
 from mipsjax.data.synth.scene import Scene
 from mipsjax.data.synth.sensor import SensorModel, measured_color, measured_depth
@@ -50,8 +50,9 @@ class SynthSequence:
         """Frames `indices` of `spec`; depth in metres outside `depth_range` becomes 0."""
         self.name = name
         self.intrinsics = intrinsics
+        self.fps = spec.fps
         self.notes: tuple[str, ...] = ()
-        self.timestamps: Float64[np.ndarray, "N"] = np.array(indices, np.float64) / FPS
+        self.timestamps: Float64[np.ndarray, "N"] = np.array(indices, np.float64) / spec.fps
         self.T_world_cam: Float64[np.ndarray, "N 4 4"] | None = spec.path().poses(self.timestamps)
         self._spec, self._degradations, self._indices = spec, degradations, indices
         self._depth_range = depth_range
@@ -76,13 +77,14 @@ class SynthSequence:
         return self._cache[index]
 
     def _frame(self, index: int) -> Frame:
-        time = index / FPS
+        time = index / self.fps
         image = render(self.scene, self.intrinsics, self._spec.path().poses(self._shutter(time)))
-        color, depth = image
+        color, depth = image.color, image.depth
         if self._degradations.noise:
             color, depth = self._measured(index, color, depth)
         low, high = self._depth_range
-        depth = np.where((depth >= low) & (depth <= high), depth, np.float32(0.0))
+        usable = (depth >= low) & (depth <= high) & ~image.glass
+        depth = np.where(usable, depth, np.float32(0.0))
         return Frame(number=index, timestamp=time, color=color, depth=depth)
 
     def _shutter(self, time: float) -> Float64[np.ndarray, "K"]:
