@@ -44,13 +44,15 @@ def run(
     frames: slice = slice(None),
     seed: int = 0,
     watch: Callable[[SlamState], None] = lambda state: None,
+    see: Callable[[Sequence], Sequence] = lambda sequence: sequence,
 ) -> Run:
-    """One whole sequence; the row holds the figures every table wants. `watch` sees the state after each frame.
+    """One whole sequence; the row holds the figures every table wants. `watch` sees the state after each frame, `see`
+    makes another sequence of the one on disk.
 
     `fps` counts the adjustment after the last frame, `fps_online` does not; `ate_online_cm` is the error before it.
     """
     cfg = replace(cfg, seed=seed)
-    sequence = open_sequence(path, frames=frames, input=cfg.input)
+    sequence = see(open_sequence(path, frames=frames, input=cfg.input))
     truth = sequence.T_world_cam
     state = slam.start(sequence[0], sequence.intrinsics, cfg, None if truth is None else truth[0])
     began, early = time.perf_counter(), float("nan")
