@@ -109,6 +109,26 @@ def test_doubt_grows_with_the_way_from_the_anchors():
     assert farther[0] == pytest.approx(np.hypot(cfg.loop.sigma_rotation, 5 * cfg.loop.drift_rotation))
 
 
+def test_what_is_loose_in_a_submap_is_loose_in_a_link():
+    """A frame that may have slid along x, seen from a second submap that is turned: the slide is along its z."""
+    slid = np.diag([0.1, 0, 0, 0, 0, 0.0]) ** 2
+    T_first_second = pose((0.0, 90.0, 0.0), (1.0, 0.0, 2.0))
+    T_second_cam = pose((0.0, 10.0, 0.0), (0.3, 0.2, 0.1))
+    link = links.Link(
+        keyframe(0, T_first_second @ T_second_cam)._replace(covariance=slid), keyframe(0, T_second_cam)
+    )
+    found = links.loose(link)
+    expected = np.zeros((6, 6))
+    expected[5, 5] = (links.LOOSE * 0.1) ** 2  # rotation first
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    # The measurement that is meant: an error of the frame's pose there moves it so
+    off = np.eye(4)
+    off[0, 3] = 0.1
+    wrong = links.Link(link.first._replace(T_sub_cam=off @ link.first.T_sub_cam), link.second)
+    moved = np.linalg.inv(link.T_first_second) @ wrong.T_first_second
+    np.testing.assert_allclose(np.abs(moved[:3, 3]), [0, 0, 0.1], atol=1e-12)
+
+
 def test_misfit_is_between_world_poses():
     T_cam = pose((0.0, 10.0, 0.0), (0.1, 0.0, 0.2))
     moved = pose(translation=(0.03, 0.0, 0.0))

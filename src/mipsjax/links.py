@@ -9,7 +9,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.config import Config
+from mipsjax.host.held import Matrix, moved
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse
+
+LOOSE = 2.0  # times its stated deviation that a pose is taken to be off: a loop that comes late is not to be refused
 
 
 class Link(NamedTuple):
@@ -110,6 +113,16 @@ def sigmas(link: Link, cfg: Config) -> tuple[float, float]:
     loop = cfg.loop
     turn, shift = loop.drift_rotation * link.reach, loop.drift * link.reach
     return float(np.hypot(loop.sigma_rotation, turn)), float(np.hypot(loop.sigma, shift))
+
+
+def loose(link: Link) -> Matrix:
+    """Covariance of a linked pose by what is known of the frame's pose in both submaps, for a tangent (rotation,
+    translation) on its right, as the pose graph has it."""
+    T_first_second = link.T_first_second
+    left = link.first.covariance + moved(link.second.covariance, T_first_second)
+    right = LOOSE**2 * moved(left, inverse(T_first_second))
+    order = [3, 4, 5, 0, 1, 2]
+    return right[np.ix_(order, order)]
 
 
 def misfit(state: SlamState, first: int, second: int, link: Link) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from mipsjax.config import Config
 from mipsjax.core import correspond, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.host.factors import PointToPlane, RelativePose
-from mipsjax.links import Link, best_link, links, sigmas
+from mipsjax.links import Link, best_link, links, loose, sigmas
 from mipsjax.state import Pose, Submap
 
 EVERY = 3  # pixels between the measured points from which surface points are sought
@@ -46,11 +46,13 @@ def pair_of(submaps: Sequence[Submap], places: tuple[int, int], cfg: Config) -> 
 def pose_factor(pair: Pair, trusted: bool, cfg: Config) -> RelativePose:
     """What the shared frame measures (Eq. 21).
 
+    What is known to be loose of the frame's poses is added, so that a loop moves that and leaves what was tight.
     Along the chain of submaps it holds all the drift since the anchor. Elsewhere the frame was registered in a
     submap that it did not drift in.
     """
     turn, shift = sigmas(pair.link, cfg) if pair.chained else (cfg.loop.sigma_rotation, cfg.loop.sigma)
-    return RelativePose(*pair.places, pair.link.T_first_second, turn, shift, trusted)
+    T_first_second = pair.link.T_first_second
+    return RelativePose(*pair.places, T_first_second, turn, shift, trusted, loose(pair.link))
 
 
 def plane_factor(pair: Pair, trusted: bool, camera: Intrinsics, cfg: Config) -> PointToPlane | None:

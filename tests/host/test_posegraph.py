@@ -309,6 +309,24 @@ def test_37_five_false_loops_of_twelve(seed):
     )
 
 
+def test_a_loop_moves_what_was_loose_and_leaves_what_was_tight():
+    """One of the edges of a ring slid along its x, and says so."""
+    rng = np.random.default_rng(21)
+    truth = ring(8)
+    start, chain = chained(truth, rng, 0.005, 0.001)
+    slide = pose([0, 0, 0], [0.5, 0, 0])
+    added = np.zeros((6, 6))
+    added[3, 3] = 0.5**2
+    slid = chain[3]._replace(T_first_second=chain[3].T_first_second @ slide, added=added)
+    edges = [*chain[:3], slid, *chain[4:]]
+    for k in range(4, 8):
+        start[k] = start[k - 1] @ edges[k - 1].T_first_second
+    found = solve(start, [*edges, pose_edge(0, 7, relative(truth, 0, 7), rng)])
+    assert found.weights.all()
+    off = np.linalg.norm((found.T_world_sub - truth)[:, :3, 3], axis=1)
+    assert off.max() < 0.05, "of half a metre"
+
+
 def test_three_true_loops_outvote_one_that_repeats_the_drift():
     """The false one agrees with the chain exactly and comes first; each true one contradicts it."""
     rng = np.random.default_rng(12)
@@ -414,6 +432,10 @@ HOLED = np.where(np.eye(20, 3) > 0, np.nan, GOOD_PLANES.p_first)
             for T in (MIRROR, 2 * np.eye(4), np.eye(4) * np.nan, np.eye(3))
         ),
         GOOD_POSE._replace(T_first_second=pose([0, 0, 0], [np.inf, 0, 0])),
+        *(
+            GOOD_POSE._replace(added=c)
+            for c in (-np.eye(6), np.full((6, 6), np.nan), np.eye(3), np.eye(6, k=1))
+        ),
         *(GOOD_PLANES._replace(sigma=s) for s in (0.0, -0.1, np.nan)),
         *(GOOD_PLANES._replace(effective_points=s) for s in (0.0, -1.0, np.nan)),
         GOOD_PLANES._replace(p_first=HOLED),

@@ -31,6 +31,14 @@ class RelativePose(NamedTuple):
     """Metres, of each axis."""
     trusted: bool = False
     """Never rejected: a sequential edge."""
+    added: Float64[np.ndarray, "6 6"] = np.zeros((6, 6))
+    """Covariance beside these, of a tangent (rotation, translation) on the right: what is known to be loose."""
+
+    @property
+    def covariance(self) -> Float64[np.ndarray, "6 6"]:
+        """Of the whole measurement."""
+        sigmas = np.repeat([self.sigma_rotation, self.sigma_translation], 3).astype(np.float64)
+        return np.diag(sigmas**2) + self.added
 
 
 class PointToPlane(NamedTuple):
@@ -79,6 +87,8 @@ def check(factor: Factor, submaps: int) -> None:
     if isinstance(factor, RelativePose):
         _check_sigma(factor, "sigma_rotation", factor.sigma_rotation)
         _check_sigma(factor, "sigma_translation", factor.sigma_translation)
+        if not _is_covariance(factor.added):
+            raise FactorError(factor, f"added must be a finite covariance 6 x 6, not {factor.added}")
         if not is_rigid(factor.T_first_second):
             raise FactorError(factor, f"T_first_second is not a rigid motion: {factor.T_first_second}")
     else:
@@ -89,6 +99,14 @@ def check(factor: Factor, submaps: int) -> None:
 def _check_sigma(factor: Factor, name: str, sigma: float) -> None:
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
         raise FactorError(factor, f"{name} must be at least {SMALLEST_SIGMA} and finite, not {sigma}")
+
+
+def _is_covariance(added: Float64[np.ndarray, "6 6"]) -> bool:
+    if np.shape(added) != (6, 6) or not np.isfinite(added).all() or not np.allclose(added, added.T):
+        return False
+    strengths = np.linalg.eigvalsh(added)
+    # Of a matrix without an inverse, rounding makes some of them negative
+    return bool(strengths[0] >= -1e-9 * max(strengths[-1], SMALLEST_SIGMA**2))
 
 
 def _check_points(factor: PointToPlane) -> None:

@@ -204,9 +204,7 @@ def _anchors(problem: _Problem, kept: Bool[np.ndarray, "F"]) -> Int[np.ndarray, 
 def _made(factor: Factor) -> gtsam.NoiseModelFactor:
     if isinstance(factor, PointToPlane):
         return _plane_factor(factor)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(
-        np.repeat([factor.sigma_rotation, factor.sigma_translation], 3).astype(np.float64)
-    )
+    noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     return gtsam.BetweenFactorPose3(factor.first, factor.second, _pose3(factor.T_first_second), noise)
 
 
