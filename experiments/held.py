@@ -22,14 +22,14 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import multiprocessing
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import product
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -44,7 +44,7 @@ from mipsjax.judge import judged
 from mipsjax.links import chain_distances, linked_pairs, links
 from mipsjax.policy import Status
 from mipsjax.presets import preset
-from mipsjax.state import SlamState, distance, inverse, pose_of, trajectory
+from mipsjax.state import SlamState, deviations_of, distance, inverse, pose_of, trajectory
 
 SLIDE_FRAMES = 12
 CHANGE_FRAMES = 15
@@ -170,14 +170,14 @@ def wrong(found: Run) -> dict[str, Any]:
 
 
 def stated(state: SlamState, found: Run) -> dict[str, Any]:
-    """Share of frames, of which anything was measured, whose error in their submap is within three times the stated
-    deviation."""
+    """Share of frames whose error in their submap is within three times the stated deviation; anchors have none."""
     true, within = found.sequence.T_world_cam, []
     for place, record in enumerate(state.records):
-        if record.info.deviation_m > 0:
+        deviation, _ = deviations_of(state, record)
+        if deviation > 0:
             anchor = state.submaps[record.submap].keyframes[0].number
             metres, _ = distance(inverse(true[anchor]) @ true[place], pose_of(state, record))
-            within.append(metres <= 3 * record.info.deviation_m)
+            within.append(metres <= 3 * deviation)
     return {"within_3_deviations": float(np.mean(within)) if within else float("nan")}
 
 
@@ -251,15 +251,15 @@ def in_a_process(task: Task, core: int) -> dict[str, Any]:
     command = [sys.executable, __file__, "--one", json.dumps(task), "--core", str(core)]
     ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if ended.returncode:
-        return task._asdict() | {"failed": f"exit code {ended.returncode}"}
+        return task._asdict() | {"sequence": task.name, "failed": f"exit code {ended.returncode}"}
     return json.loads(ended.stdout.splitlines()[-1])
 
 
 def all_of(wanted: list[Task], workers: int) -> None:
-    """All runs, as many at a time as there are workers, each on a core of its own."""
-    rows: list[dict[str, Any]] = []
-    cores: multiprocessing.SimpleQueue[int] = multiprocessing.SimpleQueue()
-    for core in range(workers):
+    """All runs, as many at a time as there are workers, each on a core of its own; replaces rows of the same runs."""
+    rows = {_key(row): row for row in _read()}
+    cores: SimpleQueue[int] = SimpleQueue()
+    for core in sorted(os.sched_getaffinity(0))[:workers]:
         cores.put(core)
 
     def work(task: Task) -> dict[str, Any]:
@@ -270,10 +270,23 @@ def all_of(wanted: list[Task], workers: int) -> None:
             cores.put(core)
 
     with ThreadPoolExecutor(workers) as pool:
-        for row in pool.map(work, wanted):
-            rows.append(row)
+        for ended in as_completed([pool.submit(work, task) for task in wanted]):
+            row = ended.result()
+            rows[_key(row)] = row
             show(row)
-            write_rows("held", rows)
+            write_rows("held", rows.values())
+
+
+def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(str(row[field]) for field in Task._fields)
+
+
+def _read() -> list[dict[str, str]]:
+    path = OUT / "held.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 COLUMNS = {
@@ -298,6 +311,7 @@ COLUMNS = {
     "near_change_mm": "near a change, mm",
     "elsewhere_mm": "elsewhere, mm",
     "fps_online": "frames/s of one core",
+    "failed": "failed",
 }
 PAGE = """# Held everywhere
 
@@ -308,8 +322,7 @@ Default preset, each run held to one core.
 
 
 def write_page() -> Path:
-    with (OUT / "held.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = _read()
     parts = [PAGE]
     for group in dict.fromkeys(row["group"] for row in rows):
         chosen = [row for row in rows if row["group"] == group]

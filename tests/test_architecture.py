@@ -35,6 +35,7 @@ NEIGHBOURS = {
     ("config", "config_submaps"),  # the whole configuration holds the part for several submaps
     ("files", "errors"),  # a file that cannot be written raises OutputError
     ("commandline", "options"),  # the command line is one source of options beside files and presets
+    ("landmarks", "links"),  # a frame of a neighbour is where the frame that both share says
     ("outputs", "options"),  # config.json holds the resolved options
     ("outputs", "summary"),  # metrics.json holds the run in numbers
 }

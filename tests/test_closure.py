@@ -129,7 +129,7 @@ def test_a_loop_that_was_not_judged_is_forgotten(ring, monkeypatch):
     sighting = Sighting(0, pose(), 0.9)
     monkeypatch.setattr(closure, "solve", lambda state, *_: (state, {}))
     no_features = replace(CFG, loop=replace(CFG.loop, features=False))
-    after = closure.close(link(alone, found, sighting, CFG), [sighting], alone, no_features)
+    after = closure.close(link(alone, found, sighting), [sighting], alone, no_features)
     assert after.loops == ()
     assert [s.keyframes for s in after.submaps] == [s.keyframes for s in alone.submaps]
 
@@ -146,7 +146,7 @@ def test_a_loop_is_closed_and_written_down(chain, monkeypatch, how):
 
     monkeypatch.setattr(closure, "recognise", recognise)
     if how == "box":
-        after = closure.close(link(before, before.submap.keyframes[-1], found, CFG), [found], before, CFG)
+        after = closure.close(link(before, before.submap.keyframes[-1], found), [found], before, CFG)
     else:
         after = closure.close(before, [], before, CFG)
     assert asked == [[1, 2] if how == "box" else [0, 1, 2]], "where a first link would be a loop"
@@ -180,7 +180,7 @@ def test_older_loops_are_judged_again(chain):
     bare = kept._replace(first=COUNT - 1, second=2)
     before = arrived(wrong._replace(loops=(kept, rejected, bare)))
     found = Sighting(0, truth[-1] @ T_LAST_CAM, 0.9)
-    after = closure.close(link(before, before.submap.keyframes[-1], found, CFG), [found], before, CFG)
+    after = closure.close(link(before, before.submap.keyframes[-1], found), [found], before, CFG)
     assert [row["weight"] for row in loops_content(after)["loops"]] == [0, 0, 1, 1]
     assert [loop.frame for loop in after.loops] == [50, 50, 50, 100]
     assert off(after, truth) < 0.1 * off(given, truth)

@@ -71,10 +71,15 @@ def test_each_frame_says_where_the_camera_is():
 
 def test_frames_of_another_submap_say_nothing_unless_one_was_begun_from_the_other():
     state, T_old_new = travelled((0,), until=2), pose((0, 40, 0), (1, 0, 2))
-    new = state.submap._replace(T_world_sub=state.submap.T_world_sub @ T_old_new)
+    anchor = state.submap.keyframes[0]._replace(number=7)
+    old = state.submap._replace(
+        keyframes=(*state.submap.keyframes, anchor._replace(T_sub_cam=T_old_new)),
+        T_world_sub=pose((0, 0, 9), (9, 0, 0)),  # what the pose graph says of it since
+    )
+    new = state.submap._replace(keyframes=(anchor,))
     expected = np.linalg.inv(T_old_new) @ PATH[2]
     for parent, count in ((None, 0), (0, 2)):
-        elsewhere = state._replace(submaps=(state.submap, new._replace(parent=parent)), active=1)
+        elsewhere = state._replace(submaps=(old, new._replace(parent=parent)), active=1)
         found = follow_all(elsewhere, frame(3), expected, CFG)
         assert len(found) == count
         for seen in found:

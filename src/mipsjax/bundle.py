@@ -62,11 +62,13 @@ def unprojected(
     return volume.moved(keyframe.T_sub_cam, p_cam)
 
 
-def views_of(keyframes: Sequence[Keyframe]) -> Views:
-    """Their depth images where they are, of a fixed size for tracking."""
+def views_of(keyframes: Sequence[Keyframe]) -> Views | None:
+    """Their depth images where they are; None of no keyframes."""
+    if not keyframes:
+        return None
     return Views(
-        jnp.asarray(np.array([k.depth for k in keyframes], np.float32)),
-        jnp.asarray(np.array([k.T_sub_cam for k in keyframes], np.float32).reshape(-1, 4, 4)),
+        jnp.asarray(np.stack([k.depth for k in keyframes])),
+        jnp.asarray(np.stack([k.T_sub_cam for k in keyframes]), jnp.float32),
     )
 
 

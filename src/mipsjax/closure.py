@@ -75,7 +75,7 @@ def close(state: SlamState, sightings: list[Sighting], before: SlamState, cfg: C
         taken = {sighting.submap for sighting in sightings}
         recognised = recognise(state, keyframe, [p for p in new if p not in taken], cfg)
         if recognised is not None:
-            state = link(state, keyframe, recognised, cfg)
+            state = link(state, keyframe, recognised)
             found.append((recognised, "features"))
     loops: list[tuple[Sighting, How]] = [pair for pair in found if pair[0].submap in new]
     if not loops and all(_agrees(state, sighting.submap, cfg) for sighting, _ in found):
@@ -150,7 +150,7 @@ def _looked_up(state: SlamState, cfg: Config) -> tuple[SlamState, list[Found]]:
             ]
             sighting = recognise(state, keyframe, places, cfg)
             if sighting is not None:
-                state = link(state, keyframe, sighting, cfg)
+                state = link(state, keyframe, sighting)
                 found.append(Found(keyframe.number, active, sighting, "features"))
     return state, found
 

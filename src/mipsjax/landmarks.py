@@ -13,6 +13,7 @@ from mipsjax.core.solvers import Landmarks
 from mipsjax.core.volume import moved
 from mipsjax.data.sequence import Frame
 from mipsjax.host.corners import Corners, Followed, corners, follow, grey_of
+from mipsjax.links import best_link
 from mipsjax.state import Pose, SlamState, inverse, pose_of
 
 
@@ -39,7 +40,7 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
         return []
     grey, found = grey_of(frame.color), list[Seen]()
     for reference in state.corners:
-        T_sub_ref = _pose(state, reference)
+        T_sub_ref = _pose(state, reference, cfg)
         if T_sub_ref is None:
             continue
         guess = inverse(T_sub_ref) @ expected
@@ -51,7 +52,7 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
     return found
 
 
-def _pose(state: SlamState, reference: Corners) -> Pose | None:
+def _pose(state: SlamState, reference: Corners, cfg: Config) -> Pose | None:
     """Of an earlier frame in the active submap; None where it is not known to a hair.
 
     It is in a submap, and in the one that was begun from it or that it was begun from: tracking went from one into the
@@ -63,7 +64,9 @@ def _pose(state: SlamState, reference: Corners) -> Pose | None:
     other = state.submaps[record.submap]
     if state.submap.parent != record.submap and other.parent != active:
         return None
-    return inverse(state.submap.T_world_sub) @ other.T_world_sub @ pose_of(state, record)
+    # By the frame with which one was begun: the pose graph moves submaps, not what they have learned
+    between = best_link(state.submap, other, True, cfg)
+    return None if between is None else between.T_first_second @ pose_of(state, record)
 
 
 def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks | None:
@@ -94,11 +97,8 @@ def with_corners(state: SlamState, frame: Frame, found: list[Seen], cfg: Config)
     if not wanted.count or frame.color is None or frame.depth is None:
         return state
     seen = {one.reference.record for one in found}
-    kept = [
-        old
-        for old in state.corners
-        if state.records[old.record].info.keyframe and (not seen or old.record in seen)
-    ]
+    keyframes = [old for old in state.corners if state.records[old.record].info.keyframe]
+    kept = keyframes[:1] + [old for old in keyframes[1:] if not seen or old.record in seen]
     if len(kept) > wanted.keyframes:
         kept = kept[: min(1, wanted.keyframes)] + kept[len(kept) - wanted.keyframes + 1 :]
     last = len(state.records) - 1

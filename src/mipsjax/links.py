@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.config import Config
-from mipsjax.host.held import Matrix, moved
+from mipsjax.host.held import Matrix, carried
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse
 
 LOOSE = 2.0  # times its stated deviation that a pose is taken to be off: a loop that comes late is not to be refused
@@ -119,8 +119,8 @@ def loose(link: Link) -> Matrix:
     """Covariance of a linked pose by what is known of the frame's pose in both submaps, for a tangent (rotation,
     translation) on its right, as the pose graph has it."""
     T_first_second = link.T_first_second
-    left = link.first.covariance + moved(link.second.covariance, T_first_second)
-    right = LOOSE**2 * moved(left, inverse(T_first_second))
+    left = link.first.covariance + carried(link.second.covariance, T_first_second)
+    right = LOOSE**2 * carried(left, inverse(T_first_second))
     order = [3, 4, 5, 0, 1, 2]
     return right[np.ix_(order, order)]
 

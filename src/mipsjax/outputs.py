@@ -168,15 +168,16 @@ def loops_content(state: SlamState) -> dict[str, Any]:
 
 def status_csv(rows: tuple[FrameRow, ...]) -> str:
     """One line a frame; a number that is not known is left empty."""
-    names = list(FrameInfo._fields)
+    *names, note = FrameInfo._fields
+    names += ["deviation_m", "deviation_deg", note]
     names[:2] = ["residual_before_m", "residual_after_m"]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["index", "timestamp", "status", *names])
     for row in rows:
-        writer.writerow(
-            [row.number, f"{row.timestamp:.6f}", row.status, *(_cell(value) for value in row.info)]
-        )
+        *numbers, note = row.info
+        cells = (_cell(value) for value in (*numbers, row.deviation_m, row.deviation_deg, note))
+        writer.writerow([row.number, f"{row.timestamp:.6f}", row.status, *cells])
     return out.getvalue()
 
 

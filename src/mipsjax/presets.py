@@ -7,6 +7,7 @@ from mipsjax.config import (
     CornerConfig,
     FieldConfig,
     GuardConfig,
+    HeldConfig,
     KeyframeConfig,
     LossConfig,
     MapConfig,
@@ -20,6 +21,8 @@ from mipsjax.config import (
 from mipsjax.config_submaps import BackgroundConfig, LoopConfig, VolumeConfig
 from mipsjax.errors import ConfigError
 
+UNLIMITED = 1e3
+"""Metres or rad: no frame is that loose."""
 UNGUARDED = GuardConfig(
     weak=0.6,
     lost=0.4,
@@ -53,6 +56,7 @@ PAPER = Config(
             method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0, known=0
         ),
         corners=CornerConfig(count=0),
+        held=HeldConfig(weak=UNLIMITED),
     ),
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),

@@ -9,10 +9,10 @@ import numpy as np
 
 from mipsjax.closure import recognise
 from mipsjax.config import Config
-from mipsjax.host.held import NONE, Matrix
+from mipsjax.host.held import NONE, Matrix, carried
 from mipsjax.policy import Status
 from mipsjax.state import Keyframe, Pose, SlamState, distance, world_pose
-from mipsjax.territory import activated, begin, registered
+from mipsjax.territory import activated, begin
 
 
 class Place(NamedTuple):
@@ -34,7 +34,8 @@ def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Place | Non
         return None
     known = state.submaps[found.submap].keyframes
     nearest = min(range(len(known)), key=lambda i: sum(distance(known[i].T_sub_cam, found.T_sub_cam)))
-    covariance = registered(known[nearest], found.T_sub_cam, cfg)
+    own = np.repeat([cfg.loop.sigma, cfg.loop.sigma_rotation], 3) ** 2
+    covariance = known[nearest].covariance + carried(np.diag(own), found.T_sub_cam)
     return Place(activated(state, found.submap), nearest, found.T_sub_cam, covariance)
 
 

@@ -17,7 +17,7 @@ from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.host.held import EXACT, at, deviations
+from mipsjax.host.held import at
 from mipsjax.landmarks import with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
@@ -128,7 +128,7 @@ def _recover(state: SlamState, frame: Frame, note: str, tracked: Tracked, cfg: C
         return _coast(state, frame, note, Status.LOST, cfg, tracked)
     details = _info(tracked)._replace(found=found, submap=place.state.active, keyframe=found == "nowhere")
     record = _record(frame, place.state, place.T_sub_cam, Status.WEAK, details, place.keyframe)
-    held = at(place.covariance, EXACT, np.eye(4))
+    held = at(place.covariance, place.T_sub_cam)
     record = record._replace(held=held, depth=thumbnail(frame.depth, state.camera))
     return place.state._replace(records=(*state.records, record), trouble=1, motion=None)
 
@@ -246,7 +246,6 @@ def _record(
 
 def _info(tracked: Tracked) -> FrameInfo:
     before, after, together = tracked.info.before, tracked.info.after, tracked.together
-    metres, radians = deviations(tracked.held.covariance, tracked.T_sub_cam)
     return FrameInfo(
         residual_before=float(before.residual),
         residual_after=float(after.residual),
@@ -255,8 +254,6 @@ def _info(tracked: Tracked) -> FrameInfo:
         surfaces=_numbers(tracked.surfaces.deviation),
         together=_numbers(together.deviation),
         free=_numbers(together.twist[-1]),
-        deviation_m=metres,
-        deviation_deg=float(np.degrees(radians)),
         searched=bool(tracked.info.searched),
         track_ms=tracked.ms,
     )

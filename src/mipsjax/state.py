@@ -13,7 +13,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.core.volume import Box
 from mipsjax.host.corners import Corners
 from mipsjax.host.features import Features
-from mipsjax.host.held import EXACT, NONE, Held, Matrix
+from mipsjax.host.held import EXACT, NONE, Held, Matrix, deviations
 from mipsjax.policy import Status
 from mipsjax.schedule import Job
 
@@ -111,11 +111,7 @@ class FrameInfo(NamedTuple):
     together: str = ""
     """The same by surfaces and corners of the image."""
     free: str = ""
-    """Of a weak frame: the motion that these leave most open, (v, omega) in the camera's frame."""
-    deviation_m: float = float("nan")
-    """Standard deviation of where the camera is in its submap."""
-    deviation_deg: float = float("nan")
-    """And of how it is turned."""
+    """The motion that these leave most open, (v, omega) in the camera's frame."""
     searched: bool = False
     """RO was run."""
     keyframe: bool = False
@@ -167,7 +163,7 @@ class SlamState(NamedTuple):
     refinement: Refinement | None = None
     """Under way."""
     corners: tuple[Corners, ...] = ()
-    """Of the last trusted frame, then of the newest keyframes before it."""
+    """Of the last trusted frame, then of keyframes before it: the newest, and the oldest that are still seen."""
     residual: float = 0.0
     """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
 
@@ -191,6 +187,11 @@ def pose_of(state: SlamState, record: Record) -> Pose:
 def last_pose(state: SlamState) -> Pose:
     """Camera-to-submap pose of the last frame, which is always in the active submap."""
     return pose_of(state, state.records[-1])
+
+
+def deviations_of(state: SlamState, record: Record) -> tuple[float, float]:
+    """Standard deviations of where a frame's camera is in its submap, metres, and of how it is turned, radians."""
+    return deviations(record.held.covariance, pose_of(state, record))
 
 
 def world_pose(state: SlamState, record: Record) -> Pose:

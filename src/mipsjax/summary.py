@@ -20,7 +20,7 @@ from mipsjax.host.agreement import DEVIATIONS, DRIFT, LIMIT, Agreement
 from mipsjax.judge import contradiction
 from mipsjax.links import unjoined
 from mipsjax.policy import Status
-from mipsjax.state import FrameInfo, SlamState, keyframes, map_bytes, trajectory
+from mipsjax.state import FrameInfo, SlamState, deviations_of, keyframes, map_bytes, trajectory
 
 try:
     import resource
@@ -46,6 +46,10 @@ class FrameRow(NamedTuple):
     """Seconds."""
     status: Status
     info: FrameInfo
+    deviation_m: float = float("nan")
+    """Standard deviation of where the camera is in its submap."""
+    deviation_deg: float = float("nan")
+    """And of how it is turned."""
 
 
 class Run(NamedTuple):
@@ -69,8 +73,7 @@ class Run(NamedTuple):
     @property
     def rows(self) -> tuple[FrameRow, ...]:
         """All frames that were read."""
-        records = () if self.state is None else self.state.records
-        return self.waited + tuple(FrameRow(r.frame, r.timestamp, r.status, r.info) for r in records)
+        return self.waited + (() if self.state is None else _rows(self.state))
 
     @property
     def T_truth_cam(self) -> Float64[np.ndarray, "N 4 4"] | None:
@@ -79,6 +82,15 @@ class Run(NamedTuple):
             return None
         first = len(self.waited)
         return self.sequence.T_world_cam[first : first + len(self.state.records)]
+
+
+def _rows(state: SlamState) -> tuple[FrameRow, ...]:
+    rows = []
+    for record in state.records:
+        metres, radians = deviations_of(state, record)
+        row = FrameRow(record.frame, record.timestamp, record.status, record.info)
+        rows.append(row._replace(deviation_m=metres, deviation_deg=math.degrees(radians)))
+    return tuple(rows)
 
 
 class Number(NamedTuple):
@@ -106,6 +118,8 @@ def reasons(run: Run) -> list[str]:
     if run.agreement is not None and run.state is not None:
         contradicted = contradiction(run.state, run.agreement)
     found = [f"lost in {lost} of {len(statuses)} frames"] if lost else []
+    if len(statuses) - statuses.count(Status.SKIPPED) < 2:
+        found.append("fewer than two usable frames")
     return [*found, contradicted] if contradicted else found
 
 

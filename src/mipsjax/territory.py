@@ -12,11 +12,11 @@ from mipsjax.bundle import INIT, MAP, adjust, choose, mapping_camera, nearest, r
 from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
-from mipsjax.host.held import NONE, Matrix, at, difference, moved
+from mipsjax.host.held import NONE, at, carried, difference
 from mipsjax.links import chain_distances, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
-from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, last_pose, rigid
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
 
 AGAIN = 3  # times at most that registration is repeated: from 9 cm off the third moves a frame by millimetres
 VIEWS = 8  # keyframes that say what a submap observed around a guess
@@ -83,7 +83,7 @@ def settle(state: SlamState, cfg: Config) -> tuple[SlamState, list[Sighting]]:
             continue
         found = sight(state, place, keyframe, expected, cfg)
         if found is not None:
-            state = link(state, keyframe, found, cfg)
+            state = link(state, keyframe, found)
             sightings.append(found)
     return state, sightings
 
@@ -143,19 +143,13 @@ def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrins
     return found
 
 
-def link(state: SlamState, keyframe: Keyframe, found: Sighting, cfg: Config) -> SlamState:
+def link(state: SlamState, keyframe: Keyframe, found: Sighting) -> SlamState:
     """The frame as a keyframe of the submap that it was found in."""
     known = state.submaps[found.submap].keyframes
     (beside,) = nearest(known, found.T_sub_cam, 1)
-    covariance = registered(beside, found.T_sub_cam, cfg)
-    shared = keyframe._replace(T_sub_cam=found.T_sub_cam, covariance=covariance)
+    # What registration itself may be off by is `loop.sigma`, which each factor has
+    shared = keyframe._replace(T_sub_cam=found.T_sub_cam, covariance=beside.covariance)
     return state.with_submap(found.submap, keyframes=(*known, shared))
-
-
-def registered(beside: Keyframe, T_sub_cam: Pose, cfg: Config) -> Matrix:
-    """Covariance of a frame that was registered in a submap, beside a keyframe of it."""
-    own = np.repeat([cfg.loop.sigma, cfg.loop.sigma_rotation], 3) ** 2
-    return beside.covariance + moved(np.diag(own), T_sub_cam)
 
 
 def govern(state: SlamState, cfg: Config) -> int:
@@ -195,8 +189,10 @@ def _begin_here(state: SlamState, cfg: Config) -> SlamState:
 
 def _support(keyframe: Keyframe, anchor: Keyframe, T_new_old: Pose) -> Keyframe:
     """A keyframe of one submap in another that begins at a later one, `anchor`."""
-    since = difference(anchor.covariance, keyframe.covariance)
-    return keyframe._replace(T_sub_cam=T_new_old @ keyframe.T_sub_cam, covariance=moved(since, T_new_old))
+    between = difference(anchor.covariance, keyframe.covariance) + difference(
+        keyframe.covariance, anchor.covariance
+    )
+    return keyframe._replace(T_sub_cam=T_new_old @ keyframe.T_sub_cam, covariance=carried(between, T_new_old))
 
 
 def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
@@ -215,8 +211,7 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
 def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
     """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
     own, last = state.submaps[place].keyframes[keyframe], state.records[-1]
-    T_new_old = own.T_sub_cam @ inverse(last_pose(state))
-    held = at(own.covariance, last.held, T_new_old)
+    held = at(own.covariance, own.T_sub_cam)
     last = last._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4), held=held)
     return activated(state, place)._replace(records=(*state.records[:-1], last))
 

@@ -13,12 +13,13 @@ from mipsjax.bundle import TRACK, nearest, random_key, views_of
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.data.sequence import Frame
-from mipsjax.host.held import NONE, Directions, Held, Matrix, directions, held
+from mipsjax.host.held import NONE, Directions, Held, Matrix, adjoint, at, directions, held, predicted
 from mipsjax.landmarks import Seen, follow_all, landmarks
 from mipsjax.policy import Status, converged, widening
 from mipsjax.state import Keyframe, Pose, Record, SlamState, distance, last_pose, rigid
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
+TRUSTED = (Status.OK, Status.WEAK)
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
 
@@ -62,32 +63,61 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         views_of(nearest(state.submap.keyframes, candidates[0], known)) if known else None,
     )
     T, info = jax.device_get((T, info))
-    T_sub_cam = rigid(T)
-    surfaces, corners = (part.astype(np.float64) / cfg.track.held.group for part in info.information)
+    surfaces, corners = _information(info, cfg)
     reference = min((keyframe.covariance for keyframe in near), key=np.trace)
+    T_sub_cam, together = rigid(T), directions(surfaces + corners)
+    expected = _predicted(reference, state, frame, T_sub_cam, cfg)
+    T_sub_cam = _carried_on(T_sub_cam, candidates[0], together, expected, cfg)
     return Tracked(
         T_sub_cam,
         info,
         found,
         directions(surfaces),
-        directions(surfaces + corners),
-        _held(state, frame, T_sub_cam, surfaces + corners, reference, cfg),
+        together,
+        held(reference, expected, T_sub_cam, surfaces + corners),
         1e3 * (perf_counter() - began),
     )
 
 
 def coasting(state: SlamState, frame: Frame, cfg: Config) -> Held:
-    """How far a frame may be off that nothing is measured of."""
-    last = state.records[-1].held
-    return _held(state, frame, last_pose(state), NONE, last.covariance, cfg)
+    """How far a frame may be off that nothing is measured of, and that is taken to be where the last one was."""
+    last, T_sub_cam = state.records[-1], last_pose(state)
+    if last.status in TRUSTED:
+        stopped = last._replace(held=at(last.held.covariance, T_sub_cam))
+        state = state._replace(records=(*state.records[:-1], stopped))
+    return _predicted(NONE, state, frame, T_sub_cam, cfg)
 
 
-def _held(
-    state: SlamState, frame: Frame, T_sub_cam: Pose, information: Matrix, reference: Matrix, cfg: Config
-) -> Held:
+def _predicted(reference: Matrix, state: SlamState, frame: Frame, T_sub_cam: Pose, cfg: Config) -> Held:
     last = state.records[-1]
     seconds = max(frame.timestamp - last.timestamp, DT_MIN)
-    return held(reference, last.held, T_sub_cam, information, seconds, cfg.track.held)
+    return predicted(reference, last.held, T_sub_cam, seconds, cfg.track.held)
+
+
+def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
+    """Of surfaces and of corners, as if those that err together were one; none of a frame that is not finite."""
+    wanted = cfg.track.held
+    given = zip(info.information, (wanted.points, wanted.corners), strict=True)
+    parts = [np.asarray(part, np.float64) / together for part, together in given]
+    surfaces, corners = (part if np.isfinite(part).all() else NONE for part in parts)
+    return surfaces, corners
+
+
+def _carried_on(T_sub_cam: Pose, T_expected: Pose, together: Directions, expected: Held, cfg: Config) -> Pose:
+    """Along directions that nothing holds, as far as the expected motion is known better than what was measured."""
+    motion = np.linalg.inv(T_expected) @ T_sub_cam
+    # To first order a twist: what is left open is a shift, or a small turn
+    off = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
+    back = adjoint(np.linalg.inv(T_sub_cam))
+    prior = back @ expected.covariance @ back.T
+    twist = np.zeros(6)
+    for deviation, direction in zip(together.deviation, together.twist, strict=True):
+        if deviation > cfg.track.held.weak:
+            share = 1 / (1 + (direction @ prior @ direction) / deviation**2)
+            twist -= share * (direction @ off) * direction
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
+    return T_sub_cam @ change if twist.any() else T_sub_cam
 
 
 def _near(state: SlamState, cfg: Config) -> list[Keyframe]:
@@ -116,7 +146,7 @@ def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
 
 def last_trusted(state: SlamState) -> Record:
     """The newest frame whose pose was measured."""
-    return next(r for r in reversed(state.records) if r.status in (Status.OK, Status.WEAK))
+    return next(r for r in reversed(state.records) if r.status in TRUSTED)
 
 
 def _scaled(motion: Pose, ratio: float) -> Pose:

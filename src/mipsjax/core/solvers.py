@@ -174,7 +174,8 @@ def information(
     the normal equations are weakest it is therefore measured how distances change when the frame is moved: the product
     of noisy normals and of a change that does not know of this noise has the right mean. Its own noise is taken off.
     """
-    variance = cfg.sensor.noise_floor**2
+    points = seen.points
+    precision = losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
     on_map, on_views = map_rows(field, T, seen.points, "whole", cfg), None
     hessian = on_map.system().hessian
     if seen.views is not None:
@@ -202,9 +203,11 @@ def information(
     weakest = directions[:, :PROBED].T
     excess = strength[:PROBED] - jnp.maximum(jax.lax.map(measured, weakest), 0)
     held = hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
+    # Points weigh relative to each other, corners relative to points: here each by what it is worth
     if seen.landmarks is None:
-        return Information(held / variance, jnp.zeros((6, 6)))
-    return Information(held / variance, landmark_system(T, seen.landmarks, camera, cfg).hessian / variance)
+        return Information(precision * held, jnp.zeros((6, 6)))
+    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian / cfg.sensor.noise_floor**2
+    return Information(precision * held, corners)
 
 
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:

@@ -119,12 +119,15 @@ def track(
     search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
     start = candidates[jnp.argmin(search_cost.at[0].multiply(cfg.track.rest))]
     before = measure_fit(field, start, points, "whole", cfg)
-    trusted = points
-    if known is not None:
-        small = camera.decimated(round(camera.width / known.depth.shape[2]))
-        learned = observed(known, transform(start, points.p_cam), small, BEHIND)
-        trusted = points._replace(mask=points.mask & learned)
-    seen = Evidence(trusted, views, landmarks, start)
+
+    def evidence(T):
+        """Of the frame about at T."""
+        trusted = points
+        if known is not None:
+            small = camera.decimated(round(camera.width / known.depth.shape[2]))
+            learned = observed(known, transform(T, points.p_cam), small, BEHIND)
+            trusted = points._replace(mask=points.mask & learned)
+        return Evidence(trusted, views, landmarks, start)
 
     limit = ro.residual if converged is None else converged
     smooth = go.method == "lm" and cfg.field.encoding == "both"
@@ -133,7 +136,7 @@ def track(
         if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
-            T = levenberg_marquardt(field, T, seen, "whole", go.steps, camera, cfg)
+            T = levenberg_marquardt(field, T, evidence(T), "whole", go.steps, camera, cfg)
         return T, measure_fit(field, T, points, "whole", cfg)
 
     def far(T):
@@ -168,7 +171,7 @@ def track(
         T, after = found
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     T = jnp.where(ok, T, start)
-    return T, TrackInfo(before, after, information(field, T, seen, camera, cfg), used_ro, ok)
+    return T, TrackInfo(before, after, information(field, T, evidence(T), camera, cfg), used_ro, ok)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))

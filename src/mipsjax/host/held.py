@@ -38,7 +38,12 @@ class Held(NamedTuple):
 
 NONE = np.zeros((6, 6))
 """The covariance of an anchor, which is where it is by definition."""
-EXACT = Held(np.zeros((12, 12)))
+MOVING = 0.05
+"""Metres, or rad, that a camera of which nothing is known may move between two frames, along each axis."""
+ROUNDING = 1e-9
+"""Of a standard deviation, relative to the largest, and of that in metres or rad: what is less is none."""
+LONGEST = 1.0
+"""Seconds: over a longer gap acceleration says nothing more."""
 
 
 class Directions(NamedTuple):
@@ -57,31 +62,43 @@ def directions(information: Matrix) -> Directions:
     return Directions(1 / np.sqrt(np.maximum(strength[::-1], least)), twists.T[::-1])
 
 
-def held(
-    reference: Matrix, last: Held, T_sub_cam: Pose, information: Matrix, seconds: float, cfg: HeldConfig
-) -> Held:
-    """After a frame that was tracked at `T_sub_cam`, `seconds` after the last one: a step of a Kalman filter.
-
-    It was measured against keyframes that are themselves off by `reference`, with the `information` of a twist in the
-    camera's frame. Where that says little the frame goes on as the last one did, give or take an acceleration, and what
-    it is off by then grows ever faster.
-    """
-    accelerated = moved(np.diag(np.repeat([cfg.acceleration, cfg.turn], 3) ** 2) * seconds**4, T_sub_cam)
-    # Relative to those keyframes: what is common to them and to the last frame is counted once
-    expected = _positive(last.joint - _padded(reference))
-    on = np.block([[np.eye(6), np.eye(6)], [NONE, np.eye(6)]])
-    expected = on @ expected @ on.T + np.tile(accelerated, (2, 2))
-    back = adjoint(np.linalg.inv(T_sub_cam))
-    measured = back.T @ information @ back
-    gain = expected[:, :6] @ np.linalg.solve(np.eye(6) + measured @ expected[:6, :6], measured)
-    return Held(_even(expected - gain @ expected[:6] + _padded(reference)))
-
-
-def at(covariance: Matrix, last: Held, T_new_old: Pose) -> Held:
-    """Of a frame whose pose is known this well in another submap, and which moves on as it did in the last one."""
-    joint = _padded(covariance)
-    joint[6:, 6:] = moved(last.joint[6:, 6:], T_new_old)
+def at(covariance: Matrix, T_sub_cam: Pose) -> Held:
+    """Of a frame whose pose is known this well, and whose motion is not."""
+    joint = np.zeros((12, 12))
+    joint[:6, :6], joint[6:, 6:] = covariance, carried(MOVING**2 * np.eye(6), T_sub_cam)
     return Held(joint)
+
+
+def predicted(reference: Matrix, last: Held, T_sub_cam: Pose, seconds: float, cfg: HeldConfig) -> Held:
+    """Before a frame is measured, about at `T_sub_cam`, `seconds` after the last one.
+
+    The camera goes on as it did, give or take an acceleration. Relative to what is off by `reference`: what is common
+    to both is counted once.
+    """
+    covariance, cross, motion = last.joint[:6, :6], last.joint[:6, 6:], last.joint[6:, 6:]
+    since = difference(covariance, reference)
+    cross = _bounded(cross, since, motion)
+    axes = np.repeat([cfg.acceleration, cfg.turn], 3) * min(seconds, LONGEST) ** 2
+    on = np.block([[np.eye(6), np.eye(6)], [NONE, np.eye(6)]])
+    joint = on @ np.block([[since, cross], [cross.T, motion]]) @ on.T
+    return Held(_positive(joint + np.tile(carried(np.diag(axes**2), T_sub_cam), (2, 2))))
+
+
+def held(reference: Matrix, expected: Held, T_sub_cam: Pose, information: Matrix) -> Held:
+    """After a frame was tracked at `T_sub_cam`, of which this was `expected`: the update of a Kalman filter.
+
+    It was measured with the `information` of a twist in the camera's frame, relative to keyframes that are themselves
+    off by `reference`. What is measured of a pose says as much of the motion that led there.
+    """
+    values, vectors = np.linalg.eigh(expected.joint)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    back = adjoint(np.linalg.inv(T_sub_cam)) @ root[:6]
+    # P - P (P + R)^-1 P, in a form that stays a covariance whatever is rounded
+    strength, axes = np.linalg.eigh(_even(back.T @ information @ back))
+    root = root @ axes
+    joint = (root / (1 + np.maximum(strength, 0))) @ root.T
+    joint[:6, :6] += reference
+    return Held(_even(joint))
 
 
 def adjoint(T_a_b: Pose) -> Matrix:
@@ -93,7 +110,7 @@ def adjoint(T_a_b: Pose) -> Matrix:
     return out
 
 
-def moved(covariance: Matrix, T_a_b: Pose) -> Matrix:
+def carried(covariance: Matrix, T_a_b: Pose) -> Matrix:
     """A covariance in frame b as one in frame a."""
     out = adjoint(T_a_b)
     return out @ covariance @ out.T
@@ -117,10 +134,21 @@ def cross(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _padded(covariance: Matrix) -> Float64[np.ndarray, "12 12"]:
-    joint = np.zeros((12, 12))
-    joint[:6, :6] = covariance
-    return joint
+def _bounded(cross: Matrix, first: Matrix, second: Matrix) -> Matrix:
+    """The covariance of two twists with each other, no more than their own allow: correlations are at most 1."""
+    root, back = _roots(first)
+    other, other_back = _roots(second)
+    u, correlation, vt = np.linalg.svd(back @ cross @ other_back)
+    return root @ (u * np.minimum(correlation, 1)) @ vt @ other
+
+
+def _roots(covariance: Matrix) -> tuple[Matrix, Matrix]:
+    """The square root, and its inverse where there is any."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = np.sqrt(np.maximum(values, 0))
+    some = root > ROUNDING * max(root[-1], ROUNDING)
+    back = np.where(some, 1 / np.where(some, root, 1), 0)
+    return (vectors * root) @ vectors.T, (vectors * back) @ vectors.T
 
 
 def _positive(matrix: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
@@ -131,3 +159,7 @@ def _positive(matrix: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
 
 def _even(matrix: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
     return (matrix + matrix.T) / 2
+
+
+EXACT = at(NONE, np.eye(4))
+"""Of an anchor."""
