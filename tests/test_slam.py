@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from compilations import compilations
-from mipsjax import slam
+from mipsjax import slam, tracker
 from mipsjax.config import Config, InputConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
@@ -199,7 +199,7 @@ def test_the_motion_goes_on_for_the_time_that_has_passed(finished, intervals, st
     state = finished._replace(motion=motion)
     last = trajectory(finished)[-1]
     now = finished.records[-1].timestamp + intervals / 30
-    candidates = slam._candidates(state, now)
+    candidates = tracker._candidates(state, now)
     moving, still = candidates[::-1] if intervals > steps else candidates
     np.testing.assert_allclose(moving, last @ translated(0.02 * steps), atol=1e-9)
     np.testing.assert_allclose(still, last, atol=1e-12)

@@ -1,0 +1,55 @@
+"""One frame in the active submap: what its pose follows where nothing holds it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import maps
+from mipsjax.config import Config
+from mipsjax.core.tracking import TrackInfo
+from mipsjax.data.sequence import Frame
+from mipsjax.host.held import NONE, Directions, Held, adjoint, at
+from mipsjax.policy import Status
+from mipsjax.state import SlamState
+from mipsjax.tracker import _carried_on, _information, coasting
+
+CFG = Config()
+T_EXPECTED = maps.pose((10.0, 20.0, 30.0), (1.0, 2.0, 3.0))
+
+
+def known(metres: float, T_sub_cam: np.ndarray) -> Held:
+    """A pose that is this well known in the camera's own directions."""
+    out = adjoint(T_sub_cam)
+    return at(metres**2 * out @ out.T, T_sub_cam)
+
+
+@pytest.mark.parametrize(("open_m", "followed"), [(0.03, 0.0), (1.0, 1.0), (0.05, 0.5)])
+def test_along_what_nothing_holds_a_frame_goes_on_as_expected(open_m, followed):
+    """By as much as that is known better: all of the way, half of it, or not where measurements hold the frame."""
+    found = T_EXPECTED @ maps.pose(translation=(0.05, 0.03, 0.0))
+    deviation = np.array([*[0.001] * 5, open_m])
+    together = Directions(deviation, np.roll(np.eye(6), -1, axis=0))
+    prior = open_m if followed == 0.5 else 0.001
+    moved = _carried_on(found, T_EXPECTED, together, known(prior, found), CFG)
+    left = (np.linalg.inv(T_EXPECTED) @ moved)[:3, 3]
+    np.testing.assert_allclose(left, [0.05 * (1 - followed), 0.03, 0.0], atol=1e-4)
+
+
+def test_a_camera_that_nobody_sees_may_be_anywhere_soon():
+    state: SlamState = maps.state(maps.submap(maps.keyframe(0)))
+    deviations = []
+    for place in range(1, 31):
+        held = coasting(state, Frame(place, place / 30, None, None), CFG)
+        deviations.append(float(np.sqrt(held.covariance[0, 0])))
+        record = state.records[-1]._replace(timestamp=place / 30, status=Status.LOST, held=held)
+        state = state._replace(records=(*state.records, record))
+    assert np.all(np.diff(deviations) > 0) and 0.5 < deviations[-1] < 5.0  # of a second, in metres
+
+
+def test_a_frame_that_is_not_finite_says_nothing():
+    held = [np.full((6, 6), np.nan, np.float32), np.eye(6, dtype=np.float32)]
+    info = TrackInfo(None, None, tuple(held), None, None)  # pyright: ignore[reportArgumentType]
+    surfaces, corners = _information(info, CFG)
+    np.testing.assert_array_equal(surfaces, NONE)
+    np.testing.assert_allclose(corners, np.eye(6) / CFG.track.held.corners)
