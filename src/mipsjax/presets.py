@@ -82,6 +82,7 @@ TINY = Config(
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
         go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
+        held=HeldConfig(weak=UNLIMITED),
     ),
     guard=UNGUARDED,
     mesh=MeshConfig(voxel=0.05),
