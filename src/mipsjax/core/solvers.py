@@ -175,7 +175,8 @@ def information(
     of noisy normals and of a change that does not know of this noise has the right mean. Its own noise is taken off.
     """
     points = seen.points
-    precision = losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
+    close_by = 1 / cfg.sensor.noise_floor**2
+    share = losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
     on_map, on_views = map_rows(field, T, seen.points, "whole", cfg), None
     hessian = on_map.system().hessian
     if seen.views is not None:
@@ -205,9 +206,9 @@ def information(
     held = hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
     # Points weigh relative to each other, corners relative to points: here each by what it is worth
     if seen.landmarks is None:
-        return Information(precision * held, jnp.zeros((6, 6)))
-    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian / cfg.sensor.noise_floor**2
-    return Information(precision * held, corners)
+        return Information(close_by * share * held, jnp.zeros((6, 6)))
+    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian
+    return Information(close_by * share * held, close_by * corners)
 
 
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
