@@ -102,6 +102,9 @@ def check_status(text: str) -> None:
         cells = dict(zip(names, row, strict=True))
         assert cells.pop("status") in set(Status)
         assert (cells.pop("found") + cells.pop("note")).isprintable()
+        for name in ("surfaces", "together", "free"):  # six numbers of a tracked frame
+            numbers = [float(number) for number in cells.pop(name).split()]
+            assert len(numbers) in (0, 6) and all(map(math.isfinite, numbers))
         assert all(math.isfinite(float(cell)) for cell in cells.values() if cell)
 
 
