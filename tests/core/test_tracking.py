@@ -19,6 +19,8 @@ from mipsjax.core import losses, solvers, tracking
 from mipsjax.core.camera import transform
 from mipsjax.core.views import Views
 
+pytestmark = pytest.mark.slow
+
 KEY = jax.random.key(7)
 WIDENING = np.float32(1)
 TRUTH = HOME @ pose((2.0, 1.0, -1.0), (0.03, 0.02, -0.02))

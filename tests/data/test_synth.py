@@ -30,6 +30,8 @@ from mipsjax.data.synth.scene import Scene
 from mipsjax.data.synth.sensor import SensorModel, depth_sigma, incidence, measured_color, measured_depth
 from mipsjax.errors import ConfigError, InputError, OutputError
 
+pytestmark = pytest.mark.slow
+
 ALL = slice(None)
 SMALL = Intrinsics(65.625, 65.625, 39.5, 29.5, 80, 60)
 
