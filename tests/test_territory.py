@@ -42,18 +42,30 @@ def test_the_nearest_shared_frame_says_where_one_lies_in_a_neighbour(neighbours)
         assert said.radians == pytest.approx(LOOP.sigma_rotation + 0.1 * LOOP.drift_rotation)
 
 
-@pytest.mark.parametrize("why", ["across a loop", "nothing shared"])
-def test_elsewhere_the_poses_of_the_submaps_say_it_and_may_be_off_by_anything(neighbours, why):
-    cfg, state = CFG, neighbours
-    if why == "across a loop":
-        cfg = replace(CFG, loop=replace(LOOP, apart=1))
-    else:
-        state = state.with_submap(0, keyframes=state.submaps[0].keyframes[:1])
+@pytest.mark.parametrize("parent", [0, None])
+def test_across_a_loop_the_poses_of_the_submaps_say_it_and_may_be_off_by_anything(neighbours, parent):
+    """Also of a submap that was begun after the camera had been lost."""
+    cfg = replace(CFG, loop=replace(LOOP, apart=1)) if parent == 0 else CFG
     T_world_old = maps.pose(translation=(0.1, 0.0, 0.0))
-    said = expect(state.with_submap(0, T_world_sub=T_world_old), 0, cfg)
+    state = neighbours.with_submap(0, T_world_sub=T_world_old).with_submap(1, parent=parent)
+    said = expect(state, 0, cfg)
     T_world_cam = state.submap.T_world_sub @ state.submap.keyframes[-1].T_sub_cam
     np.testing.assert_allclose(said.T_sub_cam, inverse(T_world_old) @ T_world_cam, atol=1e-12)
     assert said.agrees(maps.pose((90.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
+
+
+def test_where_none_is_shared_a_frame_may_be_off_by_the_drift_through_the_submaps_between(neighbours):
+    """A third submap, 0.6 m from the second and begun from it; what it sees is half a metre from its anchor."""
+    begun = maps.pose(translation=(0.6, 0.0, 0.0))
+    anchor, newest = maps.keyframe(20), maps.keyframe(21, maps.pose(translation=(0.0, 0.5, 0.0)))
+    third = maps.submap(anchor, newest, T_world_sub=T_OLD_NEW @ begun)._replace(parent=1)
+    second = neighbours.submap
+    second = second._replace(keyframes=(*second.keyframes, anchor._replace(T_sub_cam=begun)))
+    said = expect(maps.state(neighbours.submaps[0], second, third, active=2), 0, CFG)
+    np.testing.assert_allclose(said.T_sub_cam, T_OLD_NEW @ begun @ newest.T_sub_cam, atol=1e-12)
+    metres = 0.5 + 0.6 + np.linalg.norm(T_OLD_NEW[:3, 3])
+    assert said.metres == pytest.approx(LOOP.sigma + metres * LOOP.drift)
+    assert said.radians == pytest.approx(LOOP.sigma_rotation + metres * LOOP.drift_rotation)
 
 
 def lands(monkeypatch, *ends: np.ndarray, held: float = 1.0) -> list[np.ndarray]:

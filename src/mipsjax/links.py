@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -72,7 +71,14 @@ def linked_pairs(state: SlamState) -> list[tuple[int, int]]:
 
 def joined(state: SlamState, start: int) -> set[int]:
     """Submaps that shared frames connect with one, itself among them: how these lie is known."""
-    return set(_steps(len(state.submaps), linked_pairs(state), start))
+    pairs = linked_pairs(state)
+    reached, queue = {start}, [start]
+    while queue:
+        here = queue.pop()
+        beside = {b if a == here else a for a, b in pairs if here in (a, b)} - reached
+        reached |= beside
+        queue += beside
+    return reached
 
 
 def unjoined(state: SlamState) -> list[int]:
@@ -80,32 +86,30 @@ def unjoined(state: SlamState) -> list[int]:
     return sorted(set(range(len(state.submaps))) - joined(state, 0))
 
 
+def chain(state: SlamState, start: int, end: int) -> list[int]:
+    """Places of the submaps from one to another, each begun from the one before it or the other way round, both ends
+    among them; empty between parts that were begun apart. Loops are no steps: what they join stays as far apart as it
+    was."""
+    up, down = _line(state, start), _line(state, end)
+    if up[-1] != down[-1]:
+        return []
+    while len(up) > 1 and len(down) > 1 and up[-2] == down[-2]:
+        up, down = up[:-1], down[:-1]
+    return [*up, *down[-2::-1]]
+
+
+def _line(state: SlamState, place: int) -> list[int]:
+    """A submap, the one it was begun from, and so on."""
+    line = [place]
+    while (parent := state.submaps[line[-1]].parent) is not None:
+        line.append(parent)
+    return line
+
+
 def chain_distances(state: SlamState, start: int) -> list[float]:
-    """Steps along the chain from one submap to each, each step from a submap to one that was begun from it or back.
-
-    Infinite between parts that were begun apart. Loops are no steps: what they join stays as far apart as it was.
-    """
-    steps = [
-        (place, submap.parent) for place, submap in enumerate(state.submaps) if submap.parent is not None
-    ]
-    reached = _steps(len(state.submaps), steps, start)
-    return [reached.get(place, float("inf")) for place in range(len(state.submaps))]
-
-
-def _steps(count: int, edges: list[tuple[int, int]], start: int) -> dict[int, int]:
-    """Least number of edges from one of `count` places to each that can be reached."""
-    beside: list[list[int]] = [[] for _ in range(count)]
-    for a, b in edges:
-        beside[a].append(b)
-        beside[b].append(a)
-    away, queue = {start: 0}, deque([start])
-    while queue:
-        here = queue.popleft()
-        for there in beside[here]:
-            if there not in away:
-                away[there] = away[here] + 1
-                queue.append(there)
-    return away
+    """Steps along the chain from one submap to each; infinite between parts that were begun apart."""
+    ways = [chain(state, start, place) for place in range(len(state.submaps))]
+    return [len(way) - 1 if way else float("inf") for way in ways]
 
 
 def sigmas(link: Link, cfg: Config) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from mipsjax.config import Config
 from mipsjax.core import mapping, tracking, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.host.held import NONE, at, carried, difference
-from mipsjax.links import chain_distances, joined, links
+from mipsjax.links import best_link, chain, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
 from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
@@ -92,20 +93,29 @@ def expect(state: SlamState, place: int, cfg: Config) -> Expected:
     """Where the newest keyframe of the active submap lies in the submap at `place`.
 
     Near along the chain the nearest frame that both share says so, up to what tracking may have drifted since: one
-    found elsewhere has slid along surfaces that hardly hold it, or turned towards what the submap has never seen.
-    Across a loop, or where none is shared, the poses of the submaps say so, which may be off by any amount.
+    found elsewhere has slid along surfaces that hardly hold it, or turned towards what the submap has never seen. Where
+    none is shared, the poses of the submaps say so, up to what may have drifted on the way through those between.
+    Across a loop they may be off by any amount.
     """
     keyframe, other, loop = state.submap.keyframes[-1], state.submaps[place], cfg.loop
+    way = chain(state, state.active, place)
+    by_submaps = inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam
+    if not 0 < len(way) <= loop.apart:
+        return Expected(by_submaps)
     shared = links(other, state.submap)
-    if not shared or chain_distances(state, state.active)[place] >= loop.apart:
-        return Expected(inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam)
+    if not shared:
+        passed = [best_link(state.submaps[a], state.submaps[b], True, cfg) for a, b in pairwise(way)]
+        metres = float(np.linalg.norm(keyframe.T_sub_cam[:3, 3])) + sum(link.reach for link in passed if link)
+        return Expected(by_submaps, *_drifted(metres, cfg))
     away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
     nearest = min(range(len(shared)), key=away.__getitem__)
-    return Expected(
-        shared[nearest].T_first_second @ keyframe.T_sub_cam,
-        loop.sigma + loop.drift * away[nearest],
-        loop.sigma_rotation + loop.drift_rotation * away[nearest],
-    )
+    return Expected(shared[nearest].T_first_second @ keyframe.T_sub_cam, *_drifted(away[nearest], cfg))
+
+
+def _drifted(metres: float, cfg: Config) -> tuple[float, float]:
+    """Metres and radians by which a registered frame may be from where it is expected, after a way."""
+    loop = cfg.loop
+    return loop.sigma + loop.drift * metres, loop.sigma_rotation + loop.drift_rotation * metres
 
 
 def sight(
