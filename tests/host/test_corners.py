@@ -51,6 +51,30 @@ def test_a_fast_turn_is_found_from_a_guess_near_it():
     assert np.degrees(Rotation.from_matrix(truth[:3, :3].T @ found.T_ref_cam[:3, :3]).magnitude()) < 0.15
 
 
+@pytest.mark.parametrize("measured", ["all of it", "with holes"])
+@pytest.mark.parametrize(
+    ("degrees", "metres"),
+    [((0, 15, 5), (0.2, 0, 0.4)), ((0, 20, 20), (-0.5, 0, 0.3)), ((0, 25, 0), (-0.7, 0, 0.2))],
+)
+def test_a_corner_is_where_it_belongs_when_seen_from_elsewhere(degrees, metres, measured):
+    """The square around it is stretched and turned there: as it is, it is found half a pixel off, and half as often."""
+    painted, truth = painting(), pose(degrees, metres)
+    grey, depth = wall(np.eye(4), painted)
+    if measured == "with holes":
+        depth[np.random.default_rng(0).random(depth.shape) < 0.3] = 0
+        depth[:, 150:165] = 0
+    home, guess = from_home(grey, depth), truth @ pose((0, 1, 0), (0.02, 0, 0))
+    found = follow(home, wall(truth, painted)[0], guess, FEWEST, CAMERA)
+    assert found is not None and len(found.pixel) > 100
+    T_cam_ref = np.linalg.inv(truth)
+    p_cam = found.p_ref @ T_cam_ref[:3, :3].T + T_cam_ref[:3, 3]
+    off = p_cam[:, :2] / p_cam[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy) - found.pixel
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.05
+    T_error = T_cam_ref @ found.T_ref_cam
+    assert np.linalg.norm(T_error[:3, 3]) < 0.0005
+    assert np.degrees(Rotation.from_matrix(T_error[:3, :3]).magnitude()) < 0.02
+
+
 def test_a_part_that_moves_by_itself_is_left_out():
     painted = painting()
     home, (grey, _) = from_home(*wall(np.eye(4), painted)), wall(np.eye(4), painted)
