@@ -70,7 +70,10 @@ def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
         filled = [group[i % len(group)] for i in range(ALIGNED)]
         depth = np.stack([to_metres(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
-        poses = np.asarray(tracking.align(submap.learned.field, jnp.asarray(depth), start, small, cfg))
+        corners = np.stack([records[i].corners for i in filled]).astype(np.float32)
+        poses = np.asarray(
+            tracking.align(submap.learned.field, jnp.asarray(depth), start, corners, small, cfg)
+        )
         for i, pose in zip(group, poses, strict=False):
             records[i] = _moved(records[i], rigid(pose), submap.keyframes)
     return state._replace(records=tuple(records))

@@ -166,7 +166,11 @@ def _learn(
         note=frame.problem if ok else "map not finite",
     )
     record = _record(frame, state, T_sub_cam, decision.status, details)
-    record = record._replace(held=tracked.held, depth=thumbnail(frame.depth, state.camera))
+    record = record._replace(
+        held=tracked.held,
+        depth=thumbnail(frame.depth, state.camera),
+        corners=tracked.info.information.corners,
+    )
     trouble = 0 if decision.status is Status.OK else state.trouble + 1
     return state._replace(records=(*state.records, record), trouble=trouble)
 

@@ -78,6 +78,8 @@ class Record(NamedTuple):
     """How far the pose in the submap may be off."""
     depth: UInt16[np.ndarray, "h w"] | None = None
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
+    corners: Matrix = NONE
+    """How firmly corners of the image held it then (`Information.corners`)."""
 
 
 class Refinement(NamedTuple):

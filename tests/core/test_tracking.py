@@ -294,12 +294,26 @@ def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, po
     away = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.03, 0, 0)), jnp.float32)
 
     def end(points):
-        evidence = solvers.Evidence(points, expected=away)
+        weak = (CFG.sensor.noise_floor / CFG.track.prior) ** 2 * jnp.eye(6)
+        evidence = solvers.Evidence(points, prior=solvers.Prior(away, weak))
         start = jnp.asarray(TRUTH, jnp.float32)
         return solvers.levenberg_marquardt(corner_map.field, start, evidence, "whole", 10, CAMERA, CFG)
 
     nothing = points._replace(mask=jnp.zeros_like(points.mask))
     assert apart(end(nothing), away)[0] < 1e-4 and apart(end(points), TRUTH)[0] < TOLERANCE_M
+
+
+def test_the_last_alignment_moves_a_frame_as_far_as_corners_had_left_it_open(corner_map, frame):
+    """One that they did not hold, one that they held to a tenth of a millimetre, and one without any depth."""
+    depth, _ = frame
+    start = jnp.asarray(np.stack([TRUTH @ NEAR] * 3), jnp.float32)
+    depths = jnp.asarray(np.stack([depth, depth, np.zeros_like(depth)]))
+    firm = np.stack([np.zeros((6, 6)), 1e8 * np.eye(6), np.zeros((6, 6))]).astype(np.float32)
+    cfg = replace(CFG, track=replace(CFG.track, go=replace(CFG.track.go, final_steps=10)))
+    free, held, blind = tracking.align(corner_map.field, depths, start, jnp.asarray(firm), CAMERA, cfg)
+    assert apart(free, TRUTH)[0] < TOLERANCE_M
+    assert apart(held, start[1])[0] < 0.2 * apart(start[1], TRUTH)[0]
+    np.testing.assert_allclose(blind, start[2], atol=1e-6)
 
 
 def test_what_no_keyframe_observed_does_not_count_in_registration(corner_map, frame):

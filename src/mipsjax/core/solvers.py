@@ -101,6 +101,14 @@ class Information(NamedTuple):
     """By corners of the image."""
 
 
+class Prior(NamedTuple):
+    """A pose that a frame has if nothing else says where it is."""
+
+    T_sub_cam: Float[Array, "4 4"]
+    weight: Float[Array, "6 6"]
+    """Inverse covariance, relative to that of a point's distance: of a twist (v, omega) in the camera's frame."""
+
+
 class Evidence(NamedTuple):
     """What says where one frame is."""
 
@@ -108,8 +116,7 @@ class Evidence(NamedTuple):
     views: Views | None = None
     """Depth images of keyframes, decimated by a whole factor."""
     landmarks: Landmarks | None = None
-    expected: Float[Array, "4 4"] | None = None
-    """Its pose by the motion prior."""
+    prior: Prior | None = None
 
 
 def levenberg_marquardt(
@@ -127,13 +134,13 @@ def levenberg_marquardt(
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement. Depth images of keyframes are a second term where there are any, corners of the
-    image a third, and the motion prior a fourth, so weak that it counts only where nothing else holds the frame.
+    image a third, and what was known before a fourth.
     """
 
     def system(T):
         terms = systems(field, T, seen, part, camera, cfg)
-        if seen.expected is not None:
-            terms = *terms, prior_system(T, seen.expected, cfg)
+        if seen.prior is not None:
+            terms = *terms, prior_system(T, seen.prior)
         return jax.tree.map(lambda *parts: sum(parts), *terms)
 
     def step(carry, _):
@@ -272,15 +279,12 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
     return Rows(error, rows, jnp.repeat(weight[:, None], 2, 1), cost).system()
 
 
-def prior_system(T: Float[Array, "4 4"], expected: Float[Array, "4 4"], cfg: Config) -> System:
-    """Normal equations of the motion from where the frame was expected, for a twist in the camera's frame.
-
-    Scaled as those of the points, whose standard deviation is `sensor.noise_floor`.
-    """
-    weight = (cfg.sensor.noise_floor / cfg.track.prior) ** 2
-    off = jaxlie.SE3.from_matrix(jnp.linalg.inv(expected) @ T).log()
+def prior_system(T: Float[Array, "4 4"], prior: Prior) -> System:
+    """Normal equations of the motion from where the frame was before, for a twist in the camera's frame."""
+    off = jaxlie.SE3.from_matrix(jnp.linalg.inv(prior.T_sub_cam) @ T).log()
     # The derivative of the logarithm is the identity up to half of `off`, which is small where this counts
-    return System(weight * jnp.sum(off**2), weight * jnp.eye(6), weight * off)
+    slope = prior.weight @ off
+    return System(off @ slope, prior.weight, slope)
 
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:

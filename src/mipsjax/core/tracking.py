@@ -22,6 +22,7 @@ from mipsjax.core.solvers import (
     Information,
     Landmarks,
     Points,
+    Prior,
     adam,
     information,
     levenberg_marquardt,
@@ -119,6 +120,8 @@ def track(
     search_cost = jax.vmap(lambda T: measure_fit(field, T, coarse, "search", cfg).residual)(candidates)
     start = candidates[jnp.argmin(search_cost.at[0].multiply(cfg.track.rest))]
     before = measure_fit(field, start, points, "whole", cfg)
+    # So weak that it counts only where nothing else holds the frame
+    prior = Prior(start, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
 
     def evidence(T):
         """Of the frame about at T."""
@@ -127,7 +130,7 @@ def track(
             small = camera.decimated(round(camera.width / known.depth.shape[2]))
             learned = observed(known, transform(T, points.p_cam), small, BEHIND)
             trusted = points._replace(mask=points.mask & learned)
-        return Evidence(trusted, views, landmarks, start)
+        return Evidence(trusted, views, landmarks, prior)
 
     limit = ro.residual if converged is None else converged
     smooth = go.method == "lm" and cfg.field.encoding == "both"
@@ -179,25 +182,26 @@ def align(
     field: nf.Field,
     depth: Float[Array, "F H W"],
     T: Float[Array, "F 4 4"],
+    corners: Float[Array, "F 6 6"],
     camera: Intrinsics,
     cfg: Config,
 ) -> Float[Array, "F 4 4"]:
     """Poses of F frames after a few second-order steps on every pixel of their (small) depth images.
 
-    A frame that does not come out finite stays where it was.
+    `corners` is how firmly corners of the image held each of them where it is (`Information.corners`): what surfaces
+    leave free stays as it was. A frame that does not come out finite does, too.
     """
     v, u = jnp.mgrid[: camera.height, : camera.width].reshape(2, -1)
     ray = rays(v, u, camera)
 
-    def one(d, T):
+    def one(d, T, firm):
         d = d.reshape(-1)
         points = Points(ray * d[:, None], jnp.zeros_like(ray), d > 0)
-        there = levenberg_marquardt(
-            field, T, Evidence(points), "whole", cfg.track.go.final_steps, camera, cfg
-        )
+        seen = Evidence(points, prior=Prior(T, cfg.sensor.noise_floor**2 * firm))
+        there = levenberg_marquardt(field, T, seen, "whole", cfg.track.go.final_steps, camera, cfg)
         return jnp.where(jnp.all(jnp.isfinite(there)), there, T)
 
-    return jax.vmap(one)(depth, T)
+    return jax.vmap(one)(depth, T, corners)
 
 
 class Registration(NamedTuple):
