@@ -34,7 +34,8 @@ class Seen(NamedTuple):
 def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> list[Seen]:
     """Corners of the last trusted frame and of keyframes, as far as they are found; none without colour.
 
-    `expected` is the pose at which the first are looked for. The others are looked for where the ones before say.
+    `expected` is the pose at which the first are looked for. The others are looked for where the ones before say, which
+    is where they are but for a pixel.
     """
     if frame.color is None or not state.corners:
         return []
@@ -44,7 +45,7 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
         if T_sub_ref is None:
             continue
         guess = inverse(T_sub_ref) @ expected
-        followed = follow(reference, grey, guess, cfg.track.corners.fewest, state.camera)
+        followed = follow(reference, grey, guess, cfg.track.corners.fewest, state.camera, near=bool(found))
         if followed is None:
             continue
         found.append(Seen(reference, T_sub_ref, followed))

@@ -123,6 +123,7 @@ def follow(
     T_ref_cam: Float64[np.ndarray, "4 4"],
     fewest: int,
     camera: Intrinsics,
+    near: bool = False,
 ) -> Followed | None:
     """Corners of `reference` in the image `grey`, which was taken at about `T_ref_cam`.
 
@@ -131,22 +132,35 @@ def follow(
     They are followed twice: first as they are, from where they should be, then in the image as the camera of
     `reference` would have taken it, by its depth and by the motion that was found first. Seen from elsewhere the square
     around a corner is stretched, and what is nearer in it has moved farther: without the second round this makes
-    motions too small, by 1 to 2 % of a turn into a room.
+    motions too small, by 1 to 2 % of a turn into a room. Where `T_ref_cam` is known to a few pixels (`near`), that
+    round is enough.
     """
-    guess, visible = _project(reference.p_cam, np.linalg.inv(T_ref_cam), camera)
-    if visible.sum() < fewest:
-        return None
-    pixel = reference.pixel[visible]
-    there, back = _there_and_back(reference.grey, grey, pixel, guess[visible], LEVELS)
-    found = _motion(reference, np.flatnonzero(visible)[back], there[back], fewest, camera)
-    if found is None:
-        return None
-    origin = _origin(reference.depth, np.linalg.inv(found.T_ref_cam), camera)
+    if not near:
+        motion = _as_they_are(reference, grey, T_ref_cam, fewest, camera)
+        if motion is None:
+            return None
+        T_ref_cam = motion.T_ref_cam
+    origin = _origin(reference.depth, np.linalg.inv(T_ref_cam), camera)
     warped = _sampled(grey, *np.moveaxis(origin, -1, 0)).astype(np.uint8)
     there, back = _there_and_back(reference.grey, warped, reference.pixel, reference.pixel, 0)
     seen = _sampled(origin, *there.T[..., None])[:, 0]
     back &= _inside(seen, camera)
     return _motion(reference, np.flatnonzero(back), seen[back], fewest, camera)
+
+
+def _as_they_are(
+    reference: Corners,
+    grey: UInt8[np.ndarray, "H W"],
+    T_ref_cam: Float64[np.ndarray, "4 4"],
+    fewest: int,
+    camera: Intrinsics,
+) -> Followed | None:
+    """The first round, on a pyramid of images."""
+    guess, visible = _project(reference.p_cam, np.linalg.inv(T_ref_cam), camera)
+    if visible.sum() < fewest:
+        return None
+    there, back = _there_and_back(reference.grey, grey, reference.pixel[visible], guess[visible], LEVELS)
+    return _motion(reference, np.flatnonzero(visible)[back], there[back], fewest, camera)
 
 
 def _project(
