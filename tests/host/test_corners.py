@@ -86,8 +86,9 @@ def test_a_part_that_moves_by_itself_is_left_out():
     assert not inside.any()
 
 
+@pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("what", ["flat", "other place", "no depth"])
-def test_nothing_to_follow_is_none(what):
+def test_nothing_to_follow_is_none(what, near):
     painted = painting()
     grey, depth = wall(np.eye(4), painted)
     if what == "flat":
@@ -95,7 +96,16 @@ def test_nothing_to_follow_is_none(what):
     elif what == "no depth":
         depth = np.zeros_like(depth)
     now = wall(np.eye(4), painting(1))[0] if what == "other place" else grey
-    assert follow(from_home(grey, depth), now, np.eye(4), FEWEST, CAMERA) is None
+    assert follow(from_home(grey, depth), now, np.eye(4), FEWEST, CAMERA, near) is None
+
+
+def test_where_the_motion_is_known_to_a_pixel_the_second_round_is_enough():
+    """From a guess that is off by 0.3 degrees, a pixel and a half."""
+    painted, truth = painting(), pose((0, 15, 5), (0.2, 0, 0.4))
+    home, now = from_home(*wall(np.eye(4), painted)), wall(truth, painted)[0]
+    found = follow(home, now, truth @ pose((0, 0.3, 0), (0.005, 0, 0)), FEWEST, CAMERA, near=True)
+    assert found is not None and len(found.pixel) > 100
+    np.testing.assert_allclose(found.T_ref_cam, truth, atol=5e-4)
 
 
 def test_the_same_corners_twice():

@@ -135,6 +135,8 @@ def follow(
     motions too small, by 1 to 2 % of a turn into a room. Where `T_ref_cam` is known to a few pixels (`near`), that
     round is enough.
     """
+    if len(reference.pixel) < fewest:
+        return None
     if not near:
         motion = _as_they_are(reference, grey, T_ref_cam, fewest, camera)
         if motion is None:
