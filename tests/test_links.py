@@ -85,6 +85,16 @@ def test_the_chain_is_made_of_submaps_begun_from_each_other():
     made = [submap(keyframe(place))._replace(parent=parent) for place, parent in enumerate(parents)]
     made[0], made[3] = (made[i]._replace(keyframes=(keyframe(i), keyframe(20))) for i in (0, 3))
     given = state(*made)
+    ways = {
+        (0, 3): [0, 1, 2, 3],
+        (3, 4): [3, 2, 1, 4],
+        (2, 0): [2, 1, 0],
+        (2, 2): [2],
+        (5, 3): [],
+        (3, 5): [],
+    }
+    for (start, end), way in ways.items():
+        assert links.chain(given, start, end) == way
     assert links.chain_distances(given, 0) == [0, 1, 2, 3, 2, INF]
     assert links.chain_distances(given, 3) == [3, 2, 1, 0, 3, INF]
     assert links.chain_distances(given, 5) == [INF] * 5 + [0]

@@ -68,6 +68,11 @@ def test_where_none_is_shared_a_frame_may_be_off_by_the_drift_through_the_submap
     assert said.radians == pytest.approx(LOOP.sigma_rotation + metres * LOOP.drift_rotation)
 
 
+def test_where_a_link_on_the_way_is_missing_a_frame_may_be_anywhere(neighbours):
+    state = neighbours.with_submap(0, keyframes=neighbours.submaps[0].keyframes[:1])
+    assert expect(state, 0, CFG).metres == expect(state, 0, CFG).radians == float("inf")
+
+
 def lands(monkeypatch, *ends: np.ndarray, held: float = 1.0) -> list[np.ndarray]:
     """Every frame fits. In turn registration ends here, then always at the last of these; returns where it began."""
     began = []

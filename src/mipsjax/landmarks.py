@@ -35,7 +35,7 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
     """Corners of the last trusted frame and of keyframes, as far as they are found; none without colour.
 
     `expected` is the pose at which the first are looked for. The others are looked for where the ones before say, which
-    is where they are but for a pixel.
+    is mostly within a pixel or two.
     """
     if frame.color is None or not state.corners:
         return []

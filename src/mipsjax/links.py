@@ -90,7 +90,7 @@ def chain(state: SlamState, start: int, end: int) -> list[int]:
     """Places of the submaps from one to another, each begun from the one before it or the other way round, both ends
     among them; empty between parts that were begun apart. Loops are no steps: what they join stays as far apart as it
     was."""
-    up, down = _line(state, start), _line(state, end)
+    up, down = _ancestry(state, start), _ancestry(state, end)
     if up[-1] != down[-1]:
         return []
     while len(up) > 1 and len(down) > 1 and up[-2] == down[-2]:
@@ -98,7 +98,7 @@ def chain(state: SlamState, start: int, end: int) -> list[int]:
     return [*up, *down[-2::-1]]
 
 
-def _line(state: SlamState, place: int) -> list[int]:
+def _ancestry(state: SlamState, place: int) -> list[int]:
     """A submap, the one it was begun from, and so on."""
     line = [place]
     while (parent := state.submaps[line[-1]].parent) is not None:

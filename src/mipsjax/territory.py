@@ -105,8 +105,8 @@ def expect(state: SlamState, place: int, cfg: Config) -> Expected:
     shared = links(other, state.submap)
     if not shared:
         passed = [best_link(state.submaps[a], state.submaps[b], True, cfg) for a, b in pairwise(way)]
-        metres = float(np.linalg.norm(keyframe.T_sub_cam[:3, 3])) + sum(link.reach for link in passed if link)
-        return Expected(by_submaps, *_drifted(metres, cfg))
+        reach = sum(float("inf") if link is None else link.reach for link in passed)
+        return Expected(by_submaps, *_drifted(float(np.linalg.norm(keyframe.T_sub_cam[:3, 3])) + reach, cfg))
     away = [distance(link.second.T_sub_cam, keyframe.T_sub_cam)[0] for link in shared]
     nearest = min(range(len(shared)), key=away.__getitem__)
     return Expected(shared[nearest].T_first_second @ keyframe.T_sub_cam, *_drifted(away[nearest], cfg))

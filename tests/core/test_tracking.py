@@ -304,16 +304,21 @@ def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, po
 
 
 def test_the_last_alignment_moves_a_frame_as_far_as_corners_had_left_it_open(corner_map, frame):
-    """One that they did not hold, one that they held to a tenth of a millimetre, and one without any depth."""
+    """One that they did not hold, one that they held to a tenth of a millimetre, one held along the camera's x axis
+    alone, and one without any depth."""
     depth, _ = frame
-    start = jnp.asarray(np.stack([TRUTH @ NEAR] * 3), jnp.float32)
-    depths = jnp.asarray(np.stack([depth, depth, np.zeros_like(depth)]))
-    firm = np.stack([np.zeros((6, 6)), 1e8 * np.eye(6), np.zeros((6, 6))]).astype(np.float32)
+    start = jnp.asarray(np.stack([TRUTH @ NEAR] * 4), jnp.float32)
+    depths = jnp.asarray(np.stack([depth, depth, depth, np.zeros_like(depth)]))
+    none, along_x = np.zeros((6, 6)), np.diag([1.0, 0, 0, 0, 0, 0])
+    firm = np.stack([none, 1e8 * np.eye(6), 1e8 * along_x, none]).astype(np.float32)
     cfg = replace(CFG, track=replace(CFG.track, go=replace(CFG.track.go, final_steps=10)))
-    free, held, blind = tracking.align(corner_map.field, depths, start, jnp.asarray(firm), CAMERA, cfg)
+    ends = tracking.align(corner_map.field, depths, start, jnp.asarray(firm), CAMERA, cfg)
+    free, held, partly, blind = np.asarray(ends)
     assert apart(free, TRUTH)[0] < TOLERANCE_M
     assert apart(held, start[1])[0] < 0.2 * apart(start[1], TRUTH)[0]
-    np.testing.assert_allclose(blind, start[2], atol=1e-6)
+    moved = np.linalg.inv(start[2]) @ partly
+    assert abs(moved[0, 3]) < 0.001 and np.linalg.norm(moved[1:3, 3]) > 0.01
+    np.testing.assert_allclose(blind, start[3], atol=1e-6)
 
 
 def test_what_no_keyframe_observed_does_not_count_in_registration(corner_map, frame):

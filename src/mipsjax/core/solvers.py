@@ -29,7 +29,7 @@ PROBED = 3  # weakest directions along which it is measured how firmly a frame i
 PROBE = 0.04  # metres by which the frame is moved for that: more than the noise of depth
 SURE = 2.0  # standard errors of that measurement by which the frame may be held less
 PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
-PRIOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
+FLOOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
 
 
 class Points(NamedTuple):
@@ -134,7 +134,7 @@ def levenberg_marquardt(
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement. Depth images of keyframes are a second term where there are any, corners of the
-    image a third, and what was known before a fourth.
+    image a third, and a prior pose a fourth.
     """
 
     def system(T):
@@ -146,7 +146,7 @@ def levenberg_marquardt(
     def step(carry, _):
         here, damping = carry
         T, now = here
-        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + PRIOR * jnp.eye(6)
+        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + FLOOR * jnp.eye(6)
         twist = -jnp.linalg.solve(damped, now.slope)
         T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
         there = T_new, system(T_new)
@@ -280,7 +280,7 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
 
 
 def prior_system(T: Float[Array, "4 4"], prior: Prior) -> System:
-    """Normal equations of the motion from where the frame was before, for a twist in the camera's frame."""
+    """Normal equations of how far a pose is from the prior one, for a twist in the camera's frame."""
     off = jaxlie.SE3.from_matrix(jnp.linalg.inv(prior.T_sub_cam) @ T).log()
     # The derivative of the logarithm is the identity up to half of `off`, which is small where this counts
     slope = prior.weight @ off

@@ -189,7 +189,7 @@ def align(
     """Poses of F frames after a few second-order steps on every pixel of their (small) depth images.
 
     `corners` is how firmly corners of the image held each of them where it is (`Information.corners`): what surfaces
-    leave free stays as it was. A frame that does not come out finite does, too.
+    leave free stays as it was. So does a frame that does not come out finite.
     """
     v, u = jnp.mgrid[: camera.height, : camera.width].reshape(2, -1)
     ray = rays(v, u, camera)

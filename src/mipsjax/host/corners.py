@@ -25,7 +25,7 @@ LEVELS = 3
 RETURN_PX = 0.5
 """A corner that is followed there and back again and ends farther off than this is not believed."""
 MEDIAN_PX = 5
-"""Side of the square of which the median is taken for a depth image without noise."""
+"""Side of the square of which the median is taken for a depth image without noise; OpenCV knows 3 and 5."""
 TEXTURE = 1e-4
 """Least eigenvalue of a window's gradients, divided by its pixels, below which a corner is not followed."""
 HYPOTHESES = 200
@@ -94,7 +94,9 @@ def _filled(depth: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     if not measured.any():
         return np.ones_like(depth)  # there are no corners either
     holes = (~measured).astype(np.uint8)
-    _, nearest = cv2.distanceTransformWithLabels(holes, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    _, nearest = cv2.distanceTransformWithLabels(
+        holes, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+    )
     nearest = np.asarray(nearest, int)
     depth_of = np.zeros(nearest.max() + 1, np.float32)
     depth_of[nearest[measured]] = depth[measured]
@@ -133,18 +135,28 @@ def follow(
     `reference` would have taken it, by its depth and by the motion that was found first. Seen from elsewhere the square
     around a corner is stretched, and what is nearer in it has moved farther: without the second round this makes
     motions too small, by 1 to 2 % of a turn into a room. Where `T_ref_cam` is known to a few pixels (`near`), that
-    round is enough.
+    round is tried alone.
     """
     if len(reference.pixel) < fewest:
         return None
-    if not near:
-        motion = _as_they_are(reference, grey, T_ref_cam, fewest, camera)
-        if motion is None:
-            return None
-        T_ref_cam = motion.T_ref_cam
+    found = _as_drawn(reference, grey, T_ref_cam, fewest, camera) if near else None
+    if found is not None:
+        return found
+    first = _as_they_are(reference, grey, T_ref_cam, fewest, camera)
+    return first and (_as_drawn(reference, grey, first.T_ref_cam, fewest, camera) or first)
+
+
+def _as_drawn(
+    reference: Corners,
+    grey: UInt8[np.ndarray, "H W"],
+    T_ref_cam: Float64[np.ndarray, "4 4"],
+    fewest: int,
+    camera: Intrinsics,
+) -> Followed | None:
+    """The second round, in the image drawn as the reference's camera would have taken it."""
     origin = _origin(reference.depth, np.linalg.inv(T_ref_cam), camera)
-    warped = _sampled(grey, *np.moveaxis(origin, -1, 0)).astype(np.uint8)
-    there, back = _there_and_back(reference.grey, warped, reference.pixel, reference.pixel, 0)
+    drawn = _sampled(grey, *np.moveaxis(origin, -1, 0))
+    there, back = _there_and_back(reference.grey, drawn, reference.pixel, reference.pixel, 0)
     seen = _sampled(origin, *there.T[..., None])[:, 0]
     back &= _inside(seen, camera)
     return _motion(reference, np.flatnonzero(back), seen[back], fewest, camera)
