@@ -188,8 +188,16 @@ def _project(
 
 
 def _sampled(image: np.ndarray, u: Float32[np.ndarray, "*N"], v: Float32[np.ndarray, "*N"]) -> np.ndarray:
-    """An image between its pixels; 0 outside of it."""
-    return np.asarray(cv2.remap(image, np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.INTER_LINEAR))
+    """An image between its pixels, and outside of it that of its nearest pixel, so that its border is no edge."""
+    return np.asarray(
+        cv2.remap(
+            image,
+            np.ascontiguousarray(u),
+            np.ascontiguousarray(v),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )
 
 
 def _inside(pixel: Float[np.ndarray, "N 2"], camera: Intrinsics) -> Bool[np.ndarray, "N"]:
