@@ -71,7 +71,7 @@ def test_a_corner_is_where_it_belongs_when_seen_from_elsewhere(degrees, metres, 
     off = p_cam[:, :2] / p_cam[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy) - found.pixel
     assert np.median(np.linalg.norm(off, axis=1)) < 0.05
     T_error = T_cam_ref @ found.T_ref_cam
-    assert np.linalg.norm(T_error[:3, 3]) < 0.0005
+    assert np.linalg.norm(T_error[:3, 3]) < 0.001
     assert np.degrees(Rotation.from_matrix(T_error[:3, :3]).magnitude()) < 0.02
 
 
@@ -105,7 +105,7 @@ def test_where_the_motion_is_known_to_a_pixel_the_second_round_is_enough():
     home, now = from_home(*wall(np.eye(4), painted)), wall(truth, painted)[0]
     found = follow(home, now, truth @ pose((0, 0.3, 0), (0.005, 0, 0)), FEWEST, CAMERA, near=True)
     assert found is not None and len(found.pixel) > 100
-    np.testing.assert_allclose(found.T_ref_cam, truth, atol=5e-4)
+    np.testing.assert_allclose(found.T_ref_cam, truth, atol=1e-3)
 
 
 def test_the_same_corners_twice():

@@ -158,7 +158,7 @@ def _as_drawn(
     drawn = _sampled(grey, *np.moveaxis(origin, -1, 0))
     there, back = _there_and_back(reference.grey, drawn, reference.pixel, reference.pixel, 0)
     seen = _sampled(origin, *there.T[..., None])[:, 0]
-    back &= _inside(seen, camera)
+    back &= _inside(seen, camera, WINDOW_PX // 2)  # the whole of its square
     return _motion(reference, np.flatnonzero(back), seen[back], fewest, camera)
 
 
@@ -200,8 +200,10 @@ def _sampled(image: np.ndarray, u: Float32[np.ndarray, "*N"], v: Float32[np.ndar
     )
 
 
-def _inside(pixel: Float[np.ndarray, "N 2"], camera: Intrinsics) -> Bool[np.ndarray, "N"]:
-    return np.all((pixel >= 0) & (pixel <= (camera.width - 1, camera.height - 1)), axis=1)
+def _inside(pixel: Float[np.ndarray, "N 2"], camera: Intrinsics, margin: int = 0) -> Bool[np.ndarray, "N"]:
+    """Which pixels lie in the image, so many of them away from its border."""
+    farthest = np.array([camera.width, camera.height]) - 1 - margin
+    return np.all((pixel >= margin) & (pixel <= farthest), axis=1)
 
 
 def _origin(
