@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # The same bits twice are promised on a CPU only. JAX reads this once, when it is first imported.
@@ -21,8 +23,23 @@ settings.load_profile("fixed")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+MAPPINGS = 30_000
+"""Pieces of memory of a process from which compiled programs are dropped: each has a few, and at 65,530 Linux gives no
+more, which ends the process where the next program is loaded."""
+
+
 def pytest_configure() -> None:
     enable_cache()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs() -> Iterator[None]:
+    """After a module, none where there are many; others come from the cache again."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
