@@ -335,6 +335,30 @@ class TrackConfig:
 
 
 @dataclass(frozen=True)
+class PairConfig:
+    """Keyframes measured against each other after the last frame, by corners and depth images of both and by no map: what
+    says that a submap has turned or bent within itself. Not in the paper."""
+
+    before: int = 3
+    """Keyframes just before each one that it is measured against."""
+    others: int = 3
+    """Earlier ones beside these, the nearest."""
+    oldest: int = 3
+    """Earlier ones beside these, the oldest: they hold what has drifted since. With all three 0 no poses are moved."""
+    translation: float = 1.0
+    """Metres between the poses of two keyframes that may see the same."""
+    rotation: float = 0.7
+    """Radians, the same."""
+    robust: float = 6.0
+    """Standard deviations, scale of the Cauchy weight of a pair."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether any keyframes are measured against each other."""
+        return self.before + self.others + self.oldest > 0
+
+
+@dataclass(frozen=True)
 class MeshConfig:
     """The surface that is written at the end."""
 
@@ -369,6 +393,7 @@ class Config:
     volume: VolumeConfig = VolumeConfig()
     background: BackgroundConfig = BackgroundConfig()
     loop: LoopConfig = LoopConfig()
+    pairs: PairConfig = PairConfig()
     correspond: CorrespondConfig = CorrespondConfig()
     blend: BlendConfig = BlendConfig()
     mesh: MeshConfig = MeshConfig()

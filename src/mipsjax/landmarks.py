@@ -88,20 +88,30 @@ def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks |
     return Landmarks(*(jnp.asarray(part) for part in (p_sub, ray, axes, mask)))
 
 
+def corners_of(frame: Frame, record: int, camera: Intrinsics, cfg: Config) -> Corners | None:
+    """Of one frame; None without colour or depth, or where the configuration wants none."""
+    count = cfg.track.corners.count
+    if not count or frame.color is None or frame.depth is None:
+        return None
+    return corners(grey_of(frame.color), frame.depth, record, count, camera)
+
+
 def with_corners(state: SlamState, frame: Frame, found: list[Seen], cfg: Config) -> SlamState:
     """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far.
 
     `found` are those that the frame showed. The newest keyframe is kept, and of the others the oldest, as long as they
     are seen: the longer a corner is followed, the less the camera drifts.
     """
-    wanted = cfg.track.corners
-    if not wanted.count or frame.color is None or frame.depth is None:
+    last, keyframe = len(state.records) - 1, state.submap.keyframes[-1]
+    newest = keyframe.corners if keyframe.number == last else None
+    if newest is None:
+        newest = corners_of(frame, last, state.camera, cfg)
+    if newest is None:
         return state
+    wanted = cfg.track.corners
     seen = {one.reference.record for one in found}
     keyframes = [old for old in state.corners if state.records[old.record].info.keyframe]
     kept = keyframes[:1] + [old for old in keyframes[1:] if not seen or old.record in seen]
     if len(kept) > wanted.keyframes:
         kept = kept[: min(1, wanted.keyframes)] + kept[len(kept) - wanted.keyframes + 1 :]
-    last = len(state.records) - 1
-    newest = corners(grey_of(frame.color), frame.depth, last, wanted.count, state.camera)
     return state._replace(corners=(newest, *kept))

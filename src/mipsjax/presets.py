@@ -12,6 +12,7 @@ from mipsjax.config import (
     LossConfig,
     MapConfig,
     MeshConfig,
+    PairConfig,
     RefineConfig,
     SampleConfig,
     SearchConfig,
@@ -63,6 +64,7 @@ PAPER = Config(
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
+    pairs=PairConfig(before=0, others=0, oldest=0),
 )
 TINY = Config(
     field=FieldConfig(

@@ -18,7 +18,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
 from mipsjax.host.held import at
-from mipsjax.landmarks import with_corners
+from mipsjax.landmarks import corners_of, with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.schedule import INLINE, Executor
@@ -176,8 +176,10 @@ def _learn(
 
 
 def _keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camera: Intrinsics) -> Keyframe:
-    """With features, if they are wanted."""
+    """With features, and with corners to be followed into other keyframes, if they are wanted."""
     keyframe = make_keyframe(frame, number, T_sub_cam, cfg, camera)
+    if cfg.pairs.wanted:
+        keyframe = keyframe._replace(corners=corners_of(frame, number, camera, cfg))
     if not ((cfg.loop.enabled and cfg.loop.features) or cfg.loop.relocalise):
         return keyframe
     assert frame.depth is not None and frame.color is not None

@@ -38,6 +38,8 @@ class Keyframe(NamedTuple):
     T_sub_cam: Pose
     features: Features | None = None
     """For loops and relocalisation; None where neither is wanted."""
+    corners: Corners | None = None
+    """To be followed into other keyframes after the last frame; None where that is not wanted."""
     covariance: Matrix = NONE
     """Of its pose, relative to the anchor (`host/held.py`)."""
 
@@ -212,9 +214,10 @@ def keyframes(state: SlamState) -> int:
 
 
 def keyframe_bytes(keyframe: Keyframe) -> int:
-    """Size of its images and features; a keyframe of several submaps is kept once."""
-    features = keyframe.features or ()
-    return keyframe.depth.nbytes + keyframe.color.nbytes + sum(part.nbytes for part in features)
+    """Size of its images, features and corners; a keyframe of several submaps is kept once."""
+    parts = [*(keyframe.features or ()), *(keyframe.corners or ())]
+    others = sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
+    return keyframe.depth.nbytes + keyframe.color.nbytes + others
 
 
 def map_bytes(state: SlamState) -> int:

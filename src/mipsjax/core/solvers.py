@@ -6,6 +6,7 @@ T(xi) = T exp(xi).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ SATURATED = 0.95  # of the truncation: beyond it the field is flat and says noth
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
+SETTLED = 3e-4  # metres, or rad: what a step is shorter than after which no more are tried
 PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
 PROBE = 0.04  # metres by which the frame is moved for that: more than the noise of depth
 SURE = 2.0  # standard errors of that measurement by which the frame may be held less
@@ -143,8 +145,17 @@ def levenberg_marquardt(
             terms = *terms, prior_system(T, seen.prior)
         return jax.tree.map(lambda *parts: sum(parts), *terms)
 
-    def step(carry, _):
-        here, damping = carry
+    return descend(system, T, steps)
+
+
+def descend(
+    system: Callable[[Float[Array, "4 4"]], System], T: Float[Array, "4 4"], steps: int
+) -> Float[Array, "4 4"]:
+    """Levenberg-Marquardt on the normal equations that `system` gives of a pose, for a twist in the camera's frame:
+    at most so many steps, none after one that is shorter than `SETTLED`."""
+
+    def step(carry):
+        here, damping, _ = carry
         T, now = here
         damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + FLOOR * jnp.eye(6)
         twist = -jnp.linalg.solve(damped, now.slope)
@@ -152,10 +163,13 @@ def levenberg_marquardt(
         there = T_new, system(T_new)
         better = there[1].cost < now.cost
         here = jax.tree.map(partial(jnp.where, better), there, here)
-        return (here, damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)), None
+        return here, damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP), jnp.linalg.norm(twist) < SETTLED
 
-    start = ((T, system(T)), jnp.float32(DAMPING))
-    ((T, _), _), _ = jax.lax.scan(step, start, None, length=steps)
+    def unless_settled(carry, _):
+        return jax.lax.cond(carry[-1], lambda ended: ended, step, carry), None
+
+    start = (T, system(T)), jnp.float32(DAMPING), jnp.bool_(False)
+    ((T, _), _, _), _ = jax.lax.scan(unless_settled, start, None, length=steps)
     return T
 
 

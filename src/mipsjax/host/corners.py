@@ -24,8 +24,16 @@ LEVELS = 3
 """Of the pyramid above the image: flow of some 50 pixels beside what the guess explains."""
 RETURN_PX = 0.5
 """A corner that is followed there and back again and ends farther off than this is not believed."""
-MEDIAN_PX = 5
-"""Side of the square of which the median is taken for a depth image without noise; OpenCV knows 3 and 5."""
+DEPTH_WIDTH = 160
+"""Pixels, about, of the depth by which an image is drawn from elsewhere: it is kept of every keyframe."""
+MEDIAN_PX = 3
+"""Side of the square of that depth of which the median is taken, so that it has no noise; OpenCV knows 3 and 5."""
+FIRST = 150
+"""Corners, the strongest, by which a motion is looked for first; where they do not do, by all."""
+ROUGHLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
+"""When following ends there: the second round does the rest."""
+EXACTLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+"""When it ends in the second round, after so many steps or a step of so many pixels."""
 TEXTURE = 1e-4
 """Least eigenvalue of a window's gradients, divided by its pixels, below which a corner is not followed."""
 HYPOTHESES = 200
@@ -42,8 +50,8 @@ class Corners(NamedTuple):
     record: int
     """Place of the frame in `SlamState.records`."""
     grey: UInt8[np.ndarray, "H W"]
-    depth: Float32[np.ndarray, "H W"]
-    """Metres, without holes and with less noise."""
+    depth: Float32[np.ndarray, "h w"]
+    """Metres, decimated, without holes and with less noise."""
     pixel: Float32[np.ndarray, "N 2"]
     p_cam: Float32[np.ndarray, "N 3"]
     """Metres, in the frame's own camera."""
@@ -85,14 +93,20 @@ def corners(
     axes = _axes(grey, pixel)
     x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
     p_cam = np.stack([x * z, y * z, z], 1).astype(np.float32)
-    return Corners(record, grey, _filled(depth), pixel, p_cam, axes)
+    every = _stride(camera)
+    return Corners(record, grey, _filled(depth[::every, ::every]), pixel, p_cam, axes)
 
 
-def _filled(depth: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+def _stride(camera: Intrinsics) -> int:
+    """Depth is decimated by this for `Corners.depth`."""
+    return max(1, round(camera.width / DEPTH_WIDTH))
+
+
+def _filled(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """The depth of the nearest measured pixel where there is none; medians, so that it is steady."""
     measured = depth > 0
     if not measured.any():
-        return np.ones_like(depth)  # there are no corners either
+        return np.ones(depth.shape, np.float32)  # there are no corners either
     holes = (~measured).astype(np.uint8)
     _, nearest = cv2.distanceTransformWithLabels(
         holes, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
@@ -142,7 +156,9 @@ def follow(
     found = _as_drawn(reference, grey, T_ref_cam, fewest, camera) if near else None
     if found is not None:
         return found
-    first = _as_they_are(reference, grey, T_ref_cam, fewest, camera)
+    first = _as_they_are(reference, grey, T_ref_cam, fewest, FIRST, camera)
+    if first is None and len(reference.pixel) > FIRST:
+        first = _as_they_are(reference, grey, T_ref_cam, fewest, len(reference.pixel), camera)
     return first and (_as_drawn(reference, grey, first.T_ref_cam, fewest, camera) or first)
 
 
@@ -156,7 +172,7 @@ def _as_drawn(
     """The second round, in the image drawn as the reference's camera would have taken it."""
     origin = _origin(reference.depth, np.linalg.inv(T_ref_cam), camera)
     drawn = _sampled(grey, *np.moveaxis(origin, -1, 0))
-    there, back = _there_and_back(reference.grey, drawn, reference.pixel, reference.pixel, 0)
+    there, back = _there_and_back(reference.grey, drawn, reference.pixel, reference.pixel, 0, EXACTLY)
     seen = _sampled(origin, *there.T[..., None])[:, 0]
     back &= _inside(seen, camera, WINDOW_PX // 2)  # the whole of its square
     return _motion(reference, np.flatnonzero(back), seen[back], fewest, camera)
@@ -167,14 +183,17 @@ def _as_they_are(
     grey: UInt8[np.ndarray, "H W"],
     T_ref_cam: Float64[np.ndarray, "4 4"],
     fewest: int,
+    most: int,
     camera: Intrinsics,
 ) -> Followed | None:
-    """The first round, on a pyramid of images."""
+    """The first round, on a pyramid of images, with at most so many corners."""
     guess, visible = _project(reference.p_cam, np.linalg.inv(T_ref_cam), camera)
-    if visible.sum() < fewest:
+    which = np.flatnonzero(visible)[:most]  # the strongest come first
+    if len(which) < fewest:
         return None
-    there, back = _there_and_back(reference.grey, grey, reference.pixel[visible], guess[visible], LEVELS)
-    return _motion(reference, np.flatnonzero(visible)[back], there[back], fewest, camera)
+    pixel, guess = reference.pixel[which], guess[which]
+    there, back = _there_and_back(reference.grey, grey, pixel, guess, LEVELS, ROUGHLY)
+    return _motion(reference, which[back], there[back], fewest, camera)
 
 
 def _project(
@@ -207,16 +226,26 @@ def _inside(pixel: Float[np.ndarray, "N 2"], camera: Intrinsics, margin: int = 0
 
 
 def _origin(
-    depth: Float32[np.ndarray, "H W"], T_cam_ref: Float64[np.ndarray, "4 4"], camera: Intrinsics
+    depth: Float32[np.ndarray, "h w"], T_cam_ref: Float64[np.ndarray, "4 4"], camera: Intrinsics
 ) -> Float32[np.ndarray, "H W 2"]:
     """Where each pixel of another camera, which sees this depth, lies in the current image."""
+    every = _stride(camera)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     by_u, by_v, fixed = (K @ T_cam_ref[:3, :3] @ np.linalg.inv(K)).T.astype(np.float32)[:, :, None, None]
     shift = (K @ T_cam_ref[:3, 3]).astype(np.float32)[:, None, None]
-    v, u = np.ogrid[: camera.height, : camera.width]
-    x, y, z = (by_u * u.astype(np.float32) + by_v * v.astype(np.float32) + fixed) * depth + shift
+    v, u = (every * axis.astype(np.float32) for axis in np.ogrid[: depth.shape[0], : depth.shape[1]])
+    x, y, z = (by_u * u + by_v * v + fixed) * depth + shift
     z = np.maximum(z, np.float32(NEAREST_M))
-    return np.stack([x / z, y / z], -1)
+    return _enlarged(np.stack([x / z, y / z], -1), every, camera)
+
+
+def _enlarged(
+    small: Float32[np.ndarray, "h w 2"], every: int, camera: Intrinsics
+) -> Float32[np.ndarray, "H W 2"]:
+    """What was decimated by `every`, at the size of the image, between its values."""
+    shrink = np.array([[1 / every, 0, 0], [0, 1 / every, 0]])
+    how, size = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, (camera.width, camera.height)
+    return np.asarray(cv2.warpAffine(small, shrink, size, flags=how, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _there_and_back(
@@ -225,11 +254,13 @@ def _there_and_back(
     pixel: Float32[np.ndarray, "N 2"],
     guess: Float32[np.ndarray, "N 2"],
     levels: int,
+    criteria: tuple[int, int, float],
 ) -> tuple[Float32[np.ndarray, "N 2"], Bool[np.ndarray, "N"]]:
     """Where the corners are now, and which of them lead back to where they came from."""
     how = {
         "winSize": (WINDOW_PX, WINDOW_PX),
         "maxLevel": levels,
+        "criteria": criteria,
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
         "minEigThreshold": TEXTURE,
     }
