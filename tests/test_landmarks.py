@@ -92,14 +92,14 @@ def test_without_colour_or_corners_there_is_nothing_to_follow():
     assert with_corners(state, frame(2, color=False), [], CFG) is state
     none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
     assert travelled((0,), until=2, cfg=none).corners == ()
-    assert landmarks([], CAMERA, none) is None
+    assert landmarks([], 4, CAMERA, none) is None
 
 
 @pytest.mark.parametrize("keyframes", [0, 2])
 def test_tracking_is_given_points_of_the_submap_where_they_are_seen(keyframes: int):
     cfg = replace(CFG, track=TrackConfig(corners=CornerConfig(keyframes=keyframes)))
     found = follow_all(travelled((0, 2), until=4, cfg=cfg), frame(5), PATH[4], cfg)
-    given = landmarks(found, CAMERA, cfg)
+    given = landmarks(found, 1 + keyframes, CAMERA, cfg)
     assert given is not None and len(given.mask) == CFG.track.corners.count * (1 + keyframes)
     count = sum(len(seen.followed.pixel) for seen in found)
     assert np.sum(given.mask) == count > 100
@@ -110,7 +110,7 @@ def test_tracking_is_given_points_of_the_submap_where_they_are_seen(keyframes: i
 
 
 def test_no_landmarks_have_the_same_shape():
-    given = landmarks([], CAMERA, CFG)
+    given = landmarks([], 4, CAMERA, CFG)
     assert given is not None and given.p_sub.shape == (SIZE, 3) and not given.mask.any()
 
 

@@ -16,6 +16,7 @@ from mipsjax.links import unjoined
 from mipsjax.rest import rested
 from mipsjax.schedule import INLINE, Executor
 from mipsjax.state import Keyframe, Pose, Record, SlamState, pose_of, rigid, thumbnail_stride, to_metres
+from mipsjax.straighten import straightened
 
 log = logging.getLogger(__name__)
 
@@ -27,10 +28,10 @@ def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamSt
     """The state after the last frame: `map.final_steps` steps of mapping of each submap, the pose graph by what they
     know then, and `track.go.final_steps` of tracking of each frame. `executor` is the one that `step` was given. Warns
     where submaps hang on nothing."""
-    state = taken_over(state, executor)
+    state = closed_again(taken_over(state, executor), cfg)
+    state, _ = straightened(state, cfg)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
-    state = closed_again(state, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":
         for place in range(len(state.submaps)):
             state = _aligned(state, place, cfg)

@@ -70,9 +70,9 @@ def _pose(state: SlamState, reference: Corners, cfg: Config) -> Pose | None:
     return None if between is None else between.T_first_second @ pose_of(state, record)
 
 
-def landmarks(found: list[Seen], camera: Intrinsics, cfg: Config) -> Landmarks | None:
-    """All of them, filled up to a fixed number; None where the configuration wants no corners."""
-    size = cfg.track.corners.count * (1 + cfg.track.corners.keyframes)
+def landmarks(found: list[Seen], frames: int, camera: Intrinsics, cfg: Config) -> Landmarks | None:
+    """Corners of at most so many frames, filled up to a fixed number; None where the configuration wants no corners."""
+    size = frames * cfg.track.corners.count
     if not size:
         return None
     p_sub, ray = np.zeros((size, 3), np.float32), np.zeros((size, 2), np.float32)

@@ -59,7 +59,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         cfg,
         views_of([near[round(i)] for i in np.linspace(0, len(near) - 1, cfg.track.go.views)]),
         np.float32(converged(state.residual, cfg)),
-        landmarks(found, state.camera, cfg),
+        landmarks(found, 1 + cfg.track.corners.keyframes, state.camera, cfg),
         views_of(nearest(state.submap.keyframes, candidates[0], known)) if known else None,
     )
     T, info = jax.device_get((T, info))

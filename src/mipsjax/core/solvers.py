@@ -68,6 +68,11 @@ def precisions(points: Points, cfg: Config) -> Float[Array, " P"]:
     return inverse / jnp.where(mean > 0, mean, 1)
 
 
+def mean_precision(points: Points, cfg: Config) -> Float[Array, ""]:
+    """Of the measured points' depths, 1 close by: what `precisions` are relative to."""
+    return losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
+
+
 class System(NamedTuple):
     """Cost, and the normal equations of one second-order step."""
 
@@ -196,46 +201,61 @@ def information(
     of noisy normals and of a change that does not know of this noise has the right mean. Its own noise is taken off.
     """
     points = seen.points
-    close_by = 1 / cfg.sensor.noise_floor**2
-    share = losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
-    on_map, on_views = map_rows(field, T, seen.points, "whole", cfg), None
-    hessian = on_map.system().hessian
-    if seen.views is not None:
-        on_views = view_rows(T, seen.points, seen.views, camera, cfg)
-        hessian += on_views.system().hessian
-    strength, directions = jnp.linalg.eigh(hessian)
+    on_map = map_rows(field, T, points, "whole", cfg)
+    on_views = None if seen.views is None else view_rows(T, points, seen.views, camera, cfg)
+    parts = [on_map] if on_views is None else [on_map, on_views]
 
     def moved(twist):
+        """Distances there, and where there are any."""
         T_moved = T @ jaxlie.SE3.exp(twist).as_matrix()
-        psi = nf.tsdf(field, transform(T_moved, seen.points.p_cam), cfg.field, "whole").psi
-        return psi, None if seen.views is None else _view_errors(T_moved, seen.points, seen.views, camera)
+        psi = nf.tsdf(field, transform(T_moved, points.p_cam), cfg.field, "whole").psi
+        there = [(psi, points.mask)]
+        if seen.views is not None:
+            errors = view_errors(T_moved, points, seen.views, camera)
+            there.append((errors.distance, errors.mask))
+        return there
+
+    surfaces = mean_precision(points, cfg) * steady_hessian(parts, moved)
+    close_by = 1 / cfg.sensor.noise_floor**2
+    # Points weigh relative to each other, corners relative to points: here each by what it is worth
+    if seen.landmarks is None:
+        return Information(close_by * surfaces, jnp.zeros((6, 6)))
+    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian
+    return Information(close_by * surfaces, close_by * corners)
+
+
+Distances = list[tuple[Float[Array, "*K P"], Bool[Array, "*K P"]]]
+"""For each part of the surfaces that points are measured against: of the points, and which of these are known."""
+
+
+def steady_hessian(
+    parts: list[Rows], moved: Callable[[Float[Array, "6"]], Distances]
+) -> Float[Array, "6 6"]:
+    """The Hessian of these parts together, without what only the noise of normals makes of it; `moved` gives the
+    distances after a twist."""
+    hessian = sum(part.system().hessian for part in parts)
+    strength, directions = jnp.linalg.eigh(hessian)
 
     def measured(direction):
         shift, turn = jnp.linalg.norm(direction[:3]), jnp.linalg.norm(direction[3:])
         size = PROBE / jnp.maximum(shift, PROBE_REACH * turn)
-        (psi, errors), (psi_back, errors_back) = moved(size * direction), moved(-size * direction)
-        each = [on_map.weight * (on_map.jacobian @ direction) * (psi - psi_back)]
-        if on_views is not None and errors is not None and errors_back is not None:
-            both = errors.mask & errors_back.mask
-            change = both * (errors.distance - errors_back.distance)
-            each.append((on_views.weight * (on_views.jacobian @ direction) * change).reshape(-1))
+        forth, back = moved(size * direction), moved(-size * direction)
+        each = []
+        for part, (there, seen), (behind, seen_too) in zip(parts, forth, back, strict=True):
+            change = (seen & seen_too) * (there - behind)
+            each.append((part.weight * (part.jacobian @ direction) * change).reshape(-1))
         strengths = jnp.concatenate(each) / (2 * size)
         return jnp.sum(strengths) - SURE * jnp.linalg.norm(strengths)
 
     weakest = directions[:, :PROBED].T
     excess = strength[:PROBED] - jnp.maximum(jax.lax.map(measured, weakest), 0)
-    held = hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
-    # Points weigh relative to each other, corners relative to points: here each by what it is worth
-    if seen.landmarks is None:
-        return Information(close_by * share * held, jnp.zeros((6, 6)))
-    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian
-    return Information(close_by * share * held, close_by * corners)
+    return hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
 
 
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
     """The points' distances to the surface in the depth image of each of K keyframes."""
     go, precision = cfg.track.go, precisions(points, cfg)[None]
-    errors = _view_errors(T, points, views, camera)
+    errors = view_errors(T, points, views, camera)
     weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / go.view_robust) ** 2)
     # A point that falls on nothing costs as much as one that is as far off as is allowed
     off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
@@ -244,7 +264,7 @@ def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intr
     return Rows(errors.distance, jacobian, weight, cost)
 
 
-def _view_errors(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics) -> PlaneErrors:
+def view_errors(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics) -> PlaneErrors:
     small = camera.decimated(round(camera.width / views.depth.shape[2]))
     return plane_errors(views, transform(T, points.p_cam), small, VIEW_REACH)
 

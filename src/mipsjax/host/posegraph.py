@@ -205,6 +205,8 @@ def _made(factor: Factor) -> gtsam.NoiseModelFactor:
     if isinstance(factor, PointToPlane):
         return _plane_factor(factor)
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
+    if np.isfinite(factor.robust):
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(factor.robust), noise)
     return gtsam.BetweenFactorPose3(factor.first, factor.second, _pose3(factor.T_first_second), noise)
 
 

@@ -1,0 +1,120 @@
+"""The pose of one frame in another, by what the two measured: their depth images and corners of the image. No map is
+asked, so that none can hand its errors on.
+
+Twists are (v, omega), metres and radians, in the second frame's camera: T(xi) = T exp(xi).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from mipsjax.config import Config
+from mipsjax.core import losses
+from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
+from mipsjax.core.solvers import (
+    Landmarks,
+    Points,
+    Prior,
+    System,
+    descend,
+    landmark_system,
+    mean_precision,
+    prior_system,
+    steady_hessian,
+    view_errors,
+    view_rows,
+)
+from mipsjax.core.views import Views
+
+
+class Pairs(NamedTuple):
+    """P pairs of frames that see the same."""
+
+    first: Float[Array, "P h w"]
+    """Depth, decimated by a whole factor; metres, 0 for no measurement."""
+    second: Float[Array, "P h w"]
+    T_first_second: Float[Array, "P 4 4"]
+    """About the pose of the second camera in the first."""
+    landmarks: Landmarks | None
+    """Corners of each first frame, in its camera, where the second one shows them."""
+
+
+class Relative(NamedTuple):
+    """What P pairs say. Inverse covariances are of a twist, 1/m^2 and 1/rad^2, as if points and corners that err
+    together were one (`track.held`)."""
+
+    T_first_second: Float[Array, "P 4 4"]
+    surfaces: Float[Array, "P 6 6"]
+    """Inverse covariance of the pose by depth images, and by the guess where these say nothing."""
+    corners: Float[Array, "P 6 6"]
+    """By corners of the image, at the trust that was given."""
+    pull: Float[Array, "P 6"]
+    """With what corners pull at that pose, and surfaces against it: the slope of their cost, 1/m and 1/rad."""
+    matched: Float[Array, " P"]
+    """Share of the second frame's points that lie on surfaces of the first."""
+
+
+@partial(jax.jit, static_argnames=("camera", "cfg"))
+def measure(pairs: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Config) -> Relative:
+    """Robust second-order steps on point-to-plane distances and on errors of corners in the image, one pair after the
+    other.
+
+    `trust` is what corners count for, relative to `track.held.corners`. `camera` is that of the images in which corners
+    were found.
+    """
+    return jax.lax.map(lambda pair: _measured(Pairs(*pair), trust, camera, cfg), tuple(pairs))
+
+
+def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Config) -> Relative:
+    """One of them, without the first axis."""
+    points = _points(pair.second, camera, cfg)
+    views = Views(pair.first[None], jnp.eye(4)[None])
+    together = cfg.track.held
+    # Points weigh relative to each other, corners by what they are worth: here both do, and as few as are independent
+    of_points, of_corners = mean_precision(points, cfg) / together.points, trust / together.corners
+    # As weak as in tracking: it counts only where nothing else holds the frame
+    prior = Prior(pair.T_first_second, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
+
+    def on_corners(T):
+        if pair.landmarks is None:
+            return System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
+        system = landmark_system(T, pair.landmarks, camera, cfg)
+        return jax.tree.map(lambda part: of_corners * part, system)
+
+    def together_at(T):
+        on_surfaces = view_rows(T, points, views, camera, cfg).system()
+        on_surfaces = jax.tree.map(lambda part: of_points * part, on_surfaces)
+        return jax.tree.map(lambda *parts: sum(parts), on_surfaces, on_corners(T), prior_system(T, prior))
+
+    def moved(twist):
+        errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera)
+        return [(errors.distance, errors.mask)]
+
+    T = descend(together_at, pair.T_first_second, cfg.track.go.steps)
+    surfaces = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
+    corners = on_corners(T)
+    hit = view_errors(T, points, views, camera).mask[0].astype(jnp.float32)
+    close_by = 1 / cfg.sensor.noise_floor**2
+    return Relative(
+        T,
+        close_by * surfaces,
+        close_by * corners.hessian,
+        close_by * corners.slope,
+        losses.masked_mean(hit, points.mask),
+    )
+
+
+def _points(depth: Float[Array, "h w"], camera: Intrinsics, cfg: Config) -> Points:
+    """Of a stripe grid of about `track.go.pixels` cells, none of them shifted: the same in each call."""
+    small = camera.decimated(round(camera.width / depth.shape[1]))
+    middle = jnp.full(2, 0.5)
+    v, u = pixel_grid(*grid_shape(cfg.track.go.pixels, *depth.shape), middle, *depth.shape)
+    d = depth[v, u]
+    p_cam = rays(v, u, small) * d[:, None]
+    return Points(p_cam, jnp.zeros_like(p_cam), d > 0)
