@@ -349,6 +349,8 @@ class PairConfig:
     """Metres between the poses of two keyframes that may see the same."""
     rotation: float = 0.7
     """Radians, the same."""
+    pixels: int = 9216
+    """Of the later keyframe, that are held against the surfaces of the earlier one."""
     robust: float = 6.0
     """Standard deviations, scale of the Cauchy weight of a pair."""
 

@@ -1,4 +1,4 @@
-"""After the last frame: bundle adjustment over all keyframes, the pose graph once more, and every frame aligned."""
+"""After the last frame: loops and keyframes once more, then every submap learned where they lie, and every frame aligned."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ ALIGNED = 16  # frames in one call of `tracking.align`
 
 
 def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
-    """The state after the last frame: `map.final_steps` steps of mapping of each submap, the pose graph by what they
-    know then, and `track.go.final_steps` of tracking of each frame. `executor` is the one that `step` was given. Warns
-    where submaps hang on nothing."""
+    """The state after the last frame: all loops once more, keyframes moved to where they lie by each other,
+    `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor` is
+    the one that `step` was given. Warns where submaps hang on nothing."""
     state = closed_again(taken_over(state, executor), cfg)
-    state, _ = straightened(state, cfg)
+    state, trust = straightened(state, cfg)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":
         for place in range(len(state.submaps)):
-            state = _aligned(state, place, cfg)
+            state = _aligned(state, place, trust, cfg)
     if apart := unjoined(state):
         log.warning(
             "submaps %s, begun by a lost camera, were never seen to overlap the first: where they lie is a guess",
@@ -62,8 +62,9 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
     return state.with_submap(place, learned=kept, keyframes=tuple(keyframes))
 
 
-def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
-    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays."""
+def _aligned(state: SlamState, place: int, trust: float, cfg: Config) -> SlamState:
+    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays. Corners
+    hold it where it was as far as they are trusted."""
     small = state.camera.decimated(thumbnail_stride(state.camera))
     submap, records = state.submaps[place], list(state.records)
     places = [i for i, r in enumerate(records) if r.submap == place and r.depth is not None]
@@ -71,7 +72,7 @@ def _aligned(state: SlamState, place: int, cfg: Config) -> SlamState:
         filled = [group[i % len(group)] for i in range(ALIGNED)]
         depth = np.stack([to_metres(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
-        corners = np.stack([records[i].corners for i in filled]).astype(np.float32)
+        corners = trust * np.stack([records[i].corners for i in filled]).astype(np.float32)
         poses = np.asarray(
             tracking.align(submap.learned.field, jnp.asarray(depth), start, corners, small, cfg)
         )

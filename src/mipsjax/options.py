@@ -180,6 +180,7 @@ RANGES: dict[str, Range] = {
     "pairs.oldest": NOT_NEGATIVE,
     "pairs.translation": POSITIVE,
     "pairs.rotation": POSITIVE,
+    "pairs.pixels": COUNT,
     "pairs.robust": POSITIVE,
     "correspond.points": COUNT,
     "correspond.newton_steps": COUNT,

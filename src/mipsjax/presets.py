@@ -87,6 +87,7 @@ TINY = Config(
         held=HeldConfig(weak=UNLIMITED),
     ),
     guard=UNGUARDED,
+    pairs=PairConfig(pixels=192),
     mesh=MeshConfig(voxel=0.05),
 )
 PRESETS = {"default": Config(), "paper": PAPER, "tiny": TINY}

@@ -290,6 +290,20 @@ def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
     assert np.linalg.eigvalsh(surfaces + corners)[0] > 10 * np.linalg.eigvalsh(system.hessian)[0]
 
 
+def test_steps_end_where_they_are_short():
+    """On the distance to a pose, which one step finds: the steps allowed after that change nothing."""
+
+    def system(T):
+        return solvers.prior_system(T, solvers.Prior(TRUTH, jnp.eye(6)))
+
+    start = jnp.asarray(TRUTH @ NEAR, jnp.float32)
+    few, many = (jax.jit(lambda T, n=n: solvers.descend(system, T, n))(start) for n in (4, 100))
+    np.testing.assert_array_equal(few, many)
+    # `SETTLED` and the damping of the last step
+    metres, degrees = apart(many, TRUTH)
+    assert metres < 1e-4 and np.radians(degrees) < 1e-4
+
+
 def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, points):
     away = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.03, 0, 0)), jnp.float32)
 

@@ -18,6 +18,7 @@ KEY = jax.random.key(11)
 REACH = 0.1
 INWARD = np.diag([1.0, -1.0, -1.0])  # of the walls x, y, z: x rises, y and z fall into the room
 TRUTH = HOME @ pose((2.0, 1.0, -1.0), (0.03, 0.02, -0.02))
+EXACT = 0.0  # growth of the noise
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def test_distances_to_the_walls_are_exact(views, on_walls):
     for offset in (0.0, 0.02, -0.03):
         wall = np.abs(on_walls - WALLS).argmin(1)
         inward = INWARD[wall]
-        errors = plane_errors(views, jnp.asarray(on_walls + offset * inward, jnp.float32), CAMERA, REACH)
+        errors = plane_errors(views, jnp.asarray(on_walls + offset * inward, jnp.float32), CAMERA, REACH, EXACT)
         assert errors.mask[0].mean() > 0.8 and errors.mask.shape == (3, len(on_walls))
         found = np.asarray(errors.distance)[np.asarray(errors.mask)]
         np.testing.assert_allclose(np.median(found), offset, atol=1e-4)
@@ -63,12 +64,12 @@ def test_distances_to_the_walls_are_exact(views, on_walls):
 
 def test_what_is_not_seen_is_masked(views, on_walls):
     behind = jnp.asarray(on_walls - 20 * HOME[:3, 2], jnp.float32)
-    assert not plane_errors(views, behind, CAMERA, REACH).mask.any()
+    assert not plane_errors(views, behind, CAMERA, REACH, EXACT).mask.any()
     wall = np.abs(on_walls - WALLS).argmin(1)
     off = jnp.asarray(on_walls + 0.15 * INWARD[wall], jnp.float32)  # the other walls are 25 cm away
-    assert not plane_errors(views, off, CAMERA, REACH).mask.any()
+    assert not plane_errors(views, off, CAMERA, REACH, EXACT).mask.any()
     empty = views._replace(depth=np.zeros_like(views.depth))
-    errors = plane_errors(empty, jnp.asarray(on_walls), CAMERA, REACH)
+    errors = plane_errors(empty, jnp.asarray(on_walls), CAMERA, REACH, EXACT)
     assert not errors.mask.any() and jnp.all(jnp.isfinite(errors.normal))
 
 

@@ -93,13 +93,13 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
         return jax.tree.map(lambda *parts: sum(parts), on_surfaces, on_corners(T), prior_system(T, prior))
 
     def moved(twist):
-        errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera)
+        errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera, cfg)
         return [(errors.distance, errors.mask)]
 
     T = descend(together_at, pair.T_first_second, cfg.track.go.steps)
     surfaces = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
     corners = on_corners(T)
-    hit = view_errors(T, points, views, camera).mask[0].astype(jnp.float32)
+    hit = view_errors(T, points, views, camera, cfg).mask[0].astype(jnp.float32)
     close_by = 1 / cfg.sensor.noise_floor**2
     return Relative(
         T,
@@ -111,10 +111,10 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
 
 
 def _points(depth: Float[Array, "h w"], camera: Intrinsics, cfg: Config) -> Points:
-    """Of a stripe grid of about `track.go.pixels` cells, none of them shifted: the same in each call."""
+    """Of a stripe grid of about `pairs.pixels` cells, none of them shifted: the same in each call."""
     small = camera.decimated(round(camera.width / depth.shape[1]))
     middle = jnp.full(2, 0.5)
-    v, u = pixel_grid(*grid_shape(cfg.track.go.pixels, *depth.shape), middle, *depth.shape)
+    v, u = pixel_grid(*grid_shape(cfg.pairs.pixels, *depth.shape), middle, *depth.shape)
     d = depth[v, u]
     p_cam = rays(v, u, small) * d[:, None]
     return Points(p_cam, jnp.zeros_like(p_cam), d > 0)

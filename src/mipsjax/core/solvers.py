@@ -28,7 +28,7 @@ DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
 SETTLED = 3e-4  # metres, or rad: what a step is shorter than after which no more are tried
 PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
-PROBE = 0.04  # metres by which the frame is moved for that: more than the noise of depth
+PROBE = 0.08  # metres by which the frame is moved for that: past the pixels from which the normal at each is taken
 SURE = 2.0  # standard errors of that measurement by which the frame may be held less
 PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
 FLOOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
@@ -211,7 +211,7 @@ def information(
         psi = nf.tsdf(field, transform(T_moved, points.p_cam), cfg.field, "whole").psi
         there = [(psi, points.mask)]
         if seen.views is not None:
-            errors = view_errors(T_moved, points, seen.views, camera)
+            errors = view_errors(T_moved, points, seen.views, camera, cfg)
             there.append((errors.distance, errors.mask))
         return there
 
@@ -255,7 +255,7 @@ def steady_hessian(
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
     """The points' distances to the surface in the depth image of each of K keyframes."""
     go, precision = cfg.track.go, precisions(points, cfg)[None]
-    errors = view_errors(T, points, views, camera)
+    errors = view_errors(T, points, views, camera, cfg)
     weight = go.view_weight * precision * errors.mask / (1 + (errors.distance / go.view_robust) ** 2)
     # A point that falls on nothing costs as much as one that is as far off as is allowed
     off = jnp.where(errors.mask, errors.distance, VIEW_REACH)
@@ -264,9 +264,12 @@ def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intr
     return Rows(errors.distance, jacobian, weight, cost)
 
 
-def view_errors(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics) -> PlaneErrors:
+def view_errors(
+    T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config
+) -> PlaneErrors:
+    """The points at a pose against the views, of which `camera` is that before they were decimated."""
     small = camera.decimated(round(camera.width / views.depth.shape[2]))
-    return plane_errors(views, transform(T, points.p_cam), small, VIEW_REACH)
+    return plane_errors(views, transform(T, points.p_cam), small, VIEW_REACH, cfg.sensor.noise_growth)
 
 
 def map_rows(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> Rows:

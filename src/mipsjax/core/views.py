@@ -13,6 +13,7 @@ from mipsjax.core.camera import Intrinsics, project, rays
 STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
 JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
 BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
+NOISE = 2.0  # deviations of the depth by which that may be more: in the noise of 3 m no plane is that even
 
 
 class Views(NamedTuple):
@@ -46,15 +47,18 @@ class PlaneErrors(NamedTuple):
     mask: Bool[Array, "K P"]
 
 
-def plane_errors(views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, reach: float) -> PlaneErrors:
-    """Projective point-to-plane distances (Blais and Levine 1995). `camera` is that of the views.
+def plane_errors(
+    views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, reach: float, noise_growth: float
+) -> PlaneErrors:
+    """Projective point-to-plane distances (Blais and Levine 1995). `camera` is that of the views, `noise_growth` that of
+    their depth (`SensorConfig`).
 
     Masked where the point is out of view, the image has no plane there, or the two are `reach` metres apart.
     """
 
     def one(depth, T_sub_cam):
         pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
-        planes = planes_at(depth, pixel.v, pixel.u, camera)
+        planes = planes_at(depth, pixel.v, pixel.u, camera, noise_growth)
         distance = jnp.sum((pixel.p_cam - planes.point) * planes.normal, -1)
         mask = pixel.inside & planes.flat & (jnp.abs(distance) < reach)
         return PlaneErrors(jnp.where(mask, distance, 0.0), planes.normal @ T_sub_cam[:3, :3].T, mask)
@@ -98,7 +102,11 @@ def _pixels(
 
 
 def planes_at(
-    depth: Float[Array, "h w"], v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
+    depth: Float[Array, "h w"],
+    v: Int[Array, " P"],
+    u: Int[Array, " P"],
+    camera: Intrinsics,
+    noise_growth: float = 0.0,
 ) -> Planes:
     """Points and normals at some pixels, from central differences of the depth image."""
     height, width = depth.shape
@@ -116,4 +124,5 @@ def planes_at(
     jumps = [jnp.abs(p[:, 2] - here[:, 2]) < JUMP * here[:, 2] for p in (right, left, down, up)]
     smooth = jnp.stack(jumps).all(0) & exists
     off = [jnp.abs(jnp.sum(((a + b) / 2 - here) * normal, -1)) for a, b in ((right, left), (down, up))]
-    return Planes(here, normal, smooth, smooth & (jnp.maximum(*off) < BEND))
+    even = BEND + NOISE * noise_growth * here[:, 2] ** 2
+    return Planes(here, normal, smooth, smooth & (jnp.maximum(*off) < even))

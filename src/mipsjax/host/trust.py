@@ -14,10 +14,12 @@ from jaxtyping import Float64
 
 from mipsjax.core.relative import Relative
 
-USUAL = 0.1
-"""Median of what `contradiction` gives where colour and depth belong together: 0.03 to 0.06 in rendered recordings."""
+USUAL = 0.03
+"""Median of what `contradiction` gives where colour and depth belong together: 0.007 to 0.02 in rendered recordings."""
 STEPS = np.geomspace(1, 1e-4, 81)
 """Of trust that are tried, from all of it downwards."""
+ROUNDING = 1e-5
+"""Of the information of corners, relative to the largest: single precision knows no better."""
 
 
 class Differing(NamedTuple):
@@ -39,17 +41,15 @@ class Differing(NamedTuple):
 def differing(measured: Relative, place: int, trust: float) -> Differing | None:
     """Of one of the pairs that were measured with this trust; None where corners alone do not hold it."""
     surfaces, corners = (np.asarray(part[place], np.float64) for part in (measured.surfaces, measured.corners))
+    if not (np.isfinite(surfaces).all() and np.isfinite(corners).all()):
+        return None
     strength = np.linalg.eigvalsh(corners)
-    if not (np.isfinite(surfaces).all() and strength[0] > ROUNDING * strength[-1]):
+    if strength[0] <= ROUNDING * strength[-1]:
         return None
     by_surfaces, by_corners = np.linalg.inv(surfaces), np.linalg.inv(corners)
     # Each alone would be where its own slope vanishes; at the pose between them both pull alike
     twist = (by_surfaces + by_corners) @ np.asarray(measured.pull[place], np.float64)
     return Differing(twist, by_surfaces, trust * by_corners)
-
-
-ROUNDING = 1e-5
-"""Of the information of corners, relative to the largest: single precision knows no better."""
 
 
 def trusted(pairs: list[Differing]) -> float:

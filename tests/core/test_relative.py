@@ -1,0 +1,107 @@
+"""Two frames against each other: the pose they agree on, what holds it, and what corners and surfaces say apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from corner import CAMERA, HOME, apart, pose, see
+from jaxtyping import Array, Float
+
+from mipsjax.config import Config, PairConfig
+from mipsjax.core import relative
+from mipsjax.core.solvers import Landmarks
+
+CFG = replace(Config(), pairs=PairConfig(pixels=2304))
+MOTION = pose((2.0, -3.0, 1.0), (0.06, -0.04, 0.05))
+GUESS = MOTION @ pose((0.5, 0.4, -0.3), (0.01, -0.015, 0.01))
+WALL_M = 2.0
+ALL = np.float32(1)
+
+
+def wall() -> np.ndarray:
+    """Depth of a plane across the optical axis."""
+    return np.full((CAMERA.height, CAMERA.width), WALL_M, np.float32)
+
+
+def corners(T_first_second: np.ndarray, depth: np.ndarray, count: int = 200) -> Landmarks:
+    """Points of the first frame, and where a second one at this pose sees them."""
+    rng = np.random.default_rng(0)
+    v, u = rng.integers(0, depth.shape[0], count), rng.integers(0, depth.shape[1], count)
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    p_first = np.stack([x, y, np.ones(count)], 1) * depth[v, u][:, None]
+    p_second = (p_first - T_first_second[:3, 3]) @ T_first_second[:3, :3]
+    axes = np.tile(np.eye(2), (count, 1, 1))
+    parts = (p_first, p_second[:, :2] / p_second[:, 2:], axes)
+    return Landmarks(*(jnp.asarray(part, jnp.float32) for part in parts), jnp.ones(count, bool))
+
+
+def measured(
+    first: np.ndarray,
+    second: np.ndarray,
+    guess: np.ndarray,
+    landmarks: Landmarks | None,
+    trust: float = 1.0,
+) -> relative.Relative:
+    """Of one pair, without the first axis."""
+    pairs = relative.Pairs(first, second, guess.astype(np.float32), landmarks)  # pyright: ignore[reportArgumentType]
+    stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], pairs)
+    found = relative.measure(stacked, np.float32(trust), CAMERA, CFG)
+    return jax.tree.map(lambda part: np.asarray(part[0]), found)
+
+
+def slope(T: np.ndarray, towards: np.ndarray) -> Float[Array, "6"]:
+    return jaxlie.SE3.from_matrix(jnp.asarray(np.linalg.inv(T) @ towards)).log()
+
+
+@pytest.mark.parametrize("by", ["surfaces", "both"])
+def test_the_pose_is_found_from_a_guess(by: str):
+    first, second = see(HOME)[0], see(HOME @ MOTION)[0]
+    found = measured(first, second, GUESS, corners(MOTION, first) if by == "both" else None)
+    metres, degrees = apart(found.T_first_second, MOTION)
+    # Exact depth, but a point falls on the nearest pixel, whose plane is known from its neighbours
+    assert metres < 0.001 and degrees < 0.03
+    assert found.matched > 0.8
+
+
+def test_a_plain_wall_leaves_open_what_corners_hold():
+    """Along it, and around its normal: as firmly as the guess, which says 0.1 m or rad."""
+    free, weak = [0, 1, 5], 1 / CFG.track.prior**2
+    alone = measured(wall(), wall(), np.eye(4), None)
+    np.testing.assert_allclose(np.diag(alone.surfaces)[free], weak, rtol=0.5)
+    assert (np.diag(alone.surfaces)[[2, 3, 4]] > 100 * weak).all()
+    np.testing.assert_array_equal(alone.corners, 0)
+    both = measured(wall(), wall(), pose((0, 0, 1), (0.02, 0, 0)), corners(np.eye(4), wall()))
+    assert (np.diag(both.corners)[free] > 100 * weak).all()
+    assert apart(both.T_first_second, np.eye(4))[0] < 2e-4  # what the guess pulls
+
+
+def test_a_frame_without_depth_stays_at_the_guess():
+    found = measured(wall(), np.zeros_like(wall()), GUESS, None)
+    np.testing.assert_allclose(found.T_first_second, GUESS, atol=1e-6)
+    assert found.matched == 0 and np.isfinite(found.surfaces).all()
+
+
+def test_less_trust_moves_the_pose_from_corners_to_surfaces():
+    first, second = see(HOME)[0], see(HOME @ MOTION)[0]
+    elsewhere = MOTION @ pose((0.2, 0, 0), (0.004, 0, 0))
+    off = []
+    for trust in (1e3, 1.0, 1e-3):
+        found = measured(first, second, MOTION, corners(elsewhere, first), trust)
+        off.append(apart(found.T_first_second, MOTION)[0])
+    assert off[0] > 0.003 and off[0] > off[1] > off[2] and off[2] < 0.001
+
+
+def test_both_pull_alike_where_they_differ():
+    """By so much that it says how far apart their own poses are: `host/trust.py` relies on it."""
+    first, second = see(HOME)[0], see(HOME @ MOTION)[0]
+    elsewhere = MOTION @ pose((0.1, -0.05, 0.08), (0.003, 0.002, -0.002))
+    found = measured(first, second, MOTION, corners(elsewhere, first))
+    surfaces, by_corners = (np.linalg.inv(part.astype(np.float64)) for part in (found.surfaces, found.corners))
+    difference = (surfaces + by_corners) @ found.pull
+    # Towards the surfaces' pose from that of the corners: Cauchy weights bend it a little
+    np.testing.assert_allclose(difference, slope(elsewhere, MOTION), atol=6e-4)

@@ -1,0 +1,168 @@
+"""Keyframes measured against each other: drift within submaps goes, and what hangs together stays together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mipsjax.bundle import make_keyframe
+from mipsjax.config import Config, CornerConfig, PairConfig, TrackConfig
+from mipsjax.core.mapping import Learned
+from mipsjax.core.volume import Box
+from mipsjax.data.sequence import Frame
+from mipsjax.landmarks import corners_of
+from mipsjax.policy import Status
+from mipsjax.state import (
+    FrameInfo,
+    Keyframe,
+    Pose,
+    Record,
+    SlamState,
+    Submap,
+    distance,
+    inverse,
+    world_pose,
+)
+from mipsjax.straighten import straightened
+from painted import CAMERA, painting, pose, wall
+
+CFG = replace(Config(), pairs=PairConfig(pixels=2304))
+COUNT = 7
+PATH = [pose((0, 1.5 * i, 0), (0.06 * i, 0.01 * i, 0)) for i in range(COUNT)]
+"""True poses in the world, which is the frame of the painted wall."""
+DRIFT = pose((0, 0.25, 0.1), (0.01, -0.005, 0.004))
+"""Of each keyframe against the one before."""
+CHANGE = 4
+"""The keyframe with which the second submap was begun."""
+EXACT_M, EXACT_RAD = 0.002, 0.001
+"""A tenth of a pixel is 0.7 mm, as in tests/host/test_corners.py; of a chain of six."""
+
+
+def drifted() -> list[Pose]:
+    out = [PATH[0]]
+    for before, after in zip(PATH, PATH[1:], strict=False):
+        out.append(out[-1] @ inverse(before) @ after @ DRIFT)
+    return out
+
+
+def keyframe(number: int, T_sub_cam: Pose, corners: bool = True) -> Keyframe:
+    grey, depth = wall(PATH[number], PAINTED)
+    frame = Frame(number, number / 30, np.repeat(grey[..., None], 3, axis=2), depth)
+    made = make_keyframe(frame, number, T_sub_cam, CFG, CAMERA)
+    return made._replace(corners=corners_of(frame, number, CAMERA, CFG)) if corners else made
+
+
+PAINTED = painting()
+
+
+def submap(numbers: list[int], world: list[Pose], corners: bool, parent: int | None) -> Submap:
+    T_world_sub = world[numbers[0]]
+    keyframes = tuple(keyframe(n, inverse(T_world_sub) @ world[n], corners) for n in numbers)
+    nothing = Learned((), ())  # pyright: ignore[reportArgumentType]
+    return Submap(nothing, Box(np.full(3, -3.0), np.full(3, 3.0)), keyframes, T_world_sub, parent)
+
+
+def travelled(world: list[Pose], corners: bool = True) -> SlamState:
+    """Two submaps that share the keyframe `CHANGE` and one before it; a frame a little after each keyframe hangs on it."""
+    first = submap(list(range(CHANGE + 1)), world, corners, None)
+    second = submap([CHANGE, CHANGE - 1, *range(CHANGE + 1, COUNT)], world, corners, 0)
+    records = []
+    for number in range(COUNT):
+        place = int(number >= CHANGE)
+        own = [k.number for k in (first, second)[place].keyframes].index(number)
+        records.append(Record(number, number / 30, place, own, np.eye(4), Status.OK, FrameInfo()))
+    return SlamState((first, second), 1, tuple(records), CAMERA, 0)
+
+
+def worst(state: SlamState) -> tuple[float, float]:
+    """Metres and radians by which a frame is off in the world."""
+    off = [distance(T, world_pose(state, record)) for T, record in zip(PATH, state.records, strict=True)]
+    return max(metres for metres, _ in off), max(radians for _, radians in off)
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[SlamState, float]:
+    return straightened(travelled(drifted()), CFG)
+
+
+def test_drift_goes_also_from_one_submap_to_the_next(found):
+    state, trust = found
+    before = worst(travelled(drifted()))
+    assert before[0] > 0.05 and before[1] > 0.02
+    metres, radians = worst(state)
+    assert metres < EXACT_M and radians < EXACT_RAD
+    assert trust == 1.0
+
+
+def test_a_keyframe_of_two_submaps_is_at_one_place(found):
+    state, _ = found
+    first, second = state.submaps
+    for number in (CHANGE - 1, CHANGE):
+        one, other = (
+            s.T_world_sub @ next(k.T_sub_cam for k in s.keyframes if k.number == number) for s in (first, second)
+        )
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    for s in state.submaps:
+        np.testing.assert_allclose(s.keyframes[0].T_sub_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_array_equal(first.T_world_sub, PATH[0])
+
+
+def test_true_poses_stay():
+    state, _ = straightened(travelled(PATH), CFG)
+    metres, radians = worst(state)
+    assert metres < EXACT_M and radians < EXACT_RAD
+
+
+def test_without_corners_surfaces_say_what_they_can():
+    """A wall holds the distance to it and two turns; the rest stays as it was."""
+    none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
+    drift, (state, trust) = drifted(), straightened(travelled(drifted(), corners=False), none)
+    assert trust == 1.0
+    off = np.array([world_pose(state, r)[2, 3] - T[2, 3] for r, T in zip(state.records, PATH, strict=True)])
+    before = np.array([T[2, 3] - true[2, 3] for T, true in zip(drift, PATH, strict=True)])
+    assert np.abs(before).max() > 5 * EXACT_M and np.abs(off).max() < EXACT_M
+    along = [world_pose(state, r)[0, 3] - T[0, 3] for r, T in zip(state.records, drift, strict=True)]
+    assert np.abs(along).max() < 0.02
+
+
+def test_one_pair_that_is_wrong_is_outvoted(monkeypatch):
+    from mipsjax import straighten
+
+    real = straighten._measured
+
+    def spoiled(nodes, pairs, trust, state, cfg):
+        said = real(nodes, pairs, trust, state, cfg)
+        T = np.array(said.T_first_second)
+        T[3] = T[3] @ pose((5, 0, 0), (0.5, 0, 0))
+        return said._replace(T_first_second=T)
+
+    monkeypatch.setattr(straighten, "_measured", spoiled)
+    metres, _ = worst(straightened(travelled(drifted()), CFG)[0])
+    assert metres < 3 * EXACT_M
+
+
+def test_a_submap_that_nothing_joins_stays_and_so_does_a_run_that_wants_no_pairs():
+    state = travelled(drifted())
+    lonely = submap([5, 6], drifted(), True, None)._replace(T_world_sub=pose((0, 90, 0), (9, 0, 0)))
+    apart = state._replace(submaps=(state.submaps[0], lonely))
+    moved, _ = straightened(apart, CFG)
+    assert moved.submaps[1] is lonely and moved.submaps[0] is not state.submaps[0]
+    off = replace(CFG, pairs=PairConfig(before=0, others=0, oldest=0))
+    assert straightened(state, off) == (state, 1.0)
+
+
+def test_a_keyframe_that_sees_nothing_of_the_others_stays_beside_the_one_before():
+    state = travelled(drifted())
+    blank = wall(PATH[COUNT - 1], np.full_like(PAINTED, 128))
+    frame = Frame(COUNT - 1, 0.2, np.repeat(blank[0][..., None], 3, axis=2), np.zeros_like(blank[1]))
+    last = state.submap.keyframes[-1]
+    empty = make_keyframe(frame, last.number, last.T_sub_cam, CFG, CAMERA)
+    empty = empty._replace(corners=corners_of(frame, last.number, CAMERA, CFG))
+    state = state.with_submap(1, keyframes=(*state.submap.keyframes[:-1], empty))
+    moved, _ = straightened(state, CFG)
+    (one, other), (before, after) = (
+        [s.T_world_sub @ k.T_sub_cam for k in s.keyframes[-2:]] for s in (state.submap, moved.submap)
+    )
+    np.testing.assert_allclose(inverse(before) @ after, inverse(one) @ other, atol=1e-4)
