@@ -136,11 +136,11 @@ def changed(cfg: Config, section: str, **fields: Any) -> Config:
     return replace(cfg, **{head: changed(inner, rest, **fields) if rest else replace(inner, **fields)})
 
 
-def write_rows(name: str, rows: Iterable[Mapping[str, Any]]) -> Path:
-    """A CSV in `experiments/out`, floats to 4 digits; the columns are those of all rows together."""
+def write_rows(name: str, rows: Iterable[Mapping[str, Any]], folder: Path = OUT) -> Path:
+    """A CSV in a folder, floats to 4 digits; the columns are those of all rows together."""
     rows = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
-    OUT.mkdir(exist_ok=True)
-    path = OUT / f"{name}.csv"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.csv"
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(
             file, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n"

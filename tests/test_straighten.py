@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ EXACT_M, EXACT_RAD = 0.002, 0.001
 
 def drifted() -> list[Pose]:
     out = [PATH[0]]
-    for before, after in zip(PATH, PATH[1:], strict=False):
+    for before, after in pairwise(PATH):
         out.append(out[-1] @ inverse(before) @ after @ DRIFT)
     return out
 
@@ -65,7 +66,7 @@ def submap(numbers: list[int], world: list[Pose], corners: bool, parent: int | N
 
 
 def travelled(world: list[Pose], corners: bool = True) -> SlamState:
-    """Two submaps that share the keyframe `CHANGE` and one before it; a frame a little after each keyframe hangs on it."""
+    """Two submaps that share the keyframe `CHANGE` and the one before it."""
     first = submap(list(range(CHANGE + 1)), world, corners, None)
     second = submap([CHANGE, CHANGE - 1, *range(CHANGE + 1, COUNT)], world, corners, 0)
     records = []

@@ -336,8 +336,8 @@ class TrackConfig:
 
 @dataclass(frozen=True)
 class PairConfig:
-    """Keyframes measured against each other after the last frame, by corners and depth images of both and by no map: what
-    says that a submap has turned or bent within itself. Not in the paper."""
+    """Keyframes measured against each other after the last frame, by corners and depth images of both and by no map:
+    what says that a submap has turned or bent within itself. Not in the paper."""
 
     before: int = 3
     """Keyframes just before each one that it is measured against."""
@@ -366,8 +366,9 @@ class MeshConfig:
 
     voxel: float = 0.02
     """Metres, edge of a cell of marching cubes."""
-    margin: float = 0.06
-    """Metres; surface is sought this far from measured points."""
+    margin: float = 0.04
+    """Metres; surface is sought this far from measured points, at least two voxels. Farther out the field goes on past
+    what was seen."""
     band: float = 0.08
     """Metres; a cell is meshed where a corner is nearer to the surface. Below the truncation, so that the jump
     of the truncated distance behind a surface is none."""

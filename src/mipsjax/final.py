@@ -1,4 +1,4 @@
-"""After the last frame: loops and keyframes once more, then every submap learned where they lie, and every frame aligned."""
+"""After the last frame: loops and keyframes once more, then submaps learned where they lie, and every frame aligned."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ ALIGNED = 16  # frames in one call of `tracking.align`
 
 def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
     """The state after the last frame: all loops once more, keyframes moved to where they lie by each other,
-    `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor` is
-    the one that `step` was given. Warns where submaps hang on nothing."""
+    `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor`
+    is the one that `step` was given. Warns where submaps hang on nothing."""
     state = closed_again(taken_over(state, executor), cfg)
     state, trust = straightened(state, cfg)
     for place in range(len(state.submaps)):

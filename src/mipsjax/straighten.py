@@ -1,9 +1,9 @@
 """After the last frame: keyframes measured against each other, and moved to where these measurements agree.
 
-Tracking hangs each frame on the map and on the frames just before it. What the map has wrong is handed on: a submap turns
-or bends within itself, and no loop between submaps sees that. Here two keyframes that saw the same say how they lie by
-their own images alone, each keyframe is measured against several, and one graph of all of them moves them, and with the
-anchors their submaps.
+Tracking hangs each frame on the map and on the frames just before it. What the map has wrong is handed on: a submap
+turns or bends within itself, and no loop between submaps sees that. Here two keyframes that saw the same say how they
+lie by their own images alone, each keyframe is measured against several, and one graph of all of them moves them, and
+with the anchors their submaps.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.config import Config
 from mipsjax.core import relative
-from mipsjax.core.camera import Intrinsics
 from mipsjax.core.solvers import Landmarks
 from mipsjax.host.corners import follow
 from mipsjax.host.factors import RelativePose
@@ -80,8 +80,8 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
 
 
 def _keyframes(state: SlamState) -> tuple[list[int], list[tuple[Keyframe, Pose]]]:
-    """All that are joined to the first submap, in the order of their numbers: each once, as the submap has it in which it
-    was tracked, and its pose in the world."""
+    """All that are joined to the first submap, in the order of their numbers: each once, as the submap has it in which
+    it was tracked, and its pose in the world."""
     places = joined(state, 0)
     found = {}
     for place in places:
@@ -132,18 +132,18 @@ def _measured(
         group = pairs[begin : begin + GROUP]
         filled = [group[i % len(group)] for i in range(GROUP)]
         given = relative.Pairs(
-            np.stack([nodes[pair.first][0].depth for pair in filled]),
-            np.stack([nodes[pair.second][0].depth for pair in filled]),
-            np.stack([pair.T_first_second for pair in filled]).astype(np.float32),
-            jax.tree.map(lambda *parts: np.stack(parts), *(_landmarks(pair, state.camera, cfg) for pair in filled)),
+            jnp.asarray(np.stack([nodes[pair.first][0].depth for pair in filled])),
+            jnp.asarray(np.stack([nodes[pair.second][0].depth for pair in filled])),
+            jnp.asarray(np.stack([pair.T_first_second for pair in filled]), jnp.float32),
+            jax.tree.map(lambda *parts: jnp.stack(parts), *(_landmarks(pair, state, cfg) for pair in filled)),
         )
         said = jax.device_get(relative.measure(given, np.float32(trust), state.camera, cfg))
         found.append(jax.tree.map(lambda part: part[: len(group)], said))  # noqa: B023 (called here)
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
-def _landmarks(pair: Pair, camera: Intrinsics, cfg: Config) -> Landmarks | None:
-    return landmarks([] if pair.seen is None else [pair.seen], 1, camera, cfg)
+def _landmarks(pair: Pair, state: SlamState, cfg: Config) -> Landmarks | None:
+    return landmarks([] if pair.seen is None else [pair.seen], 1, state.camera, cfg)
 
 
 def _pair_factors(
@@ -152,7 +152,7 @@ def _pair_factors(
     """Of pairs that corners or enough surfaces join."""
     order = [3, 4, 5, 0, 1, 2]  # of a tangent: that of the graph is (rotation, translation)
     for place, pair in enumerate(pairs):
-        T, matched = measured.T_first_second[place], float(measured.matched[place])
+        T, matched = np.asarray(measured.T_first_second[place]), float(measured.matched[place])
         information = np.asarray(measured.surfaces[place] + measured.corners[place], np.float64)
         if not (np.isfinite(T).all() and np.isfinite(information).all()):
             continue

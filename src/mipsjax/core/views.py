@@ -50,8 +50,8 @@ class PlaneErrors(NamedTuple):
 def plane_errors(
     views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, reach: float, noise_growth: float
 ) -> PlaneErrors:
-    """Projective point-to-plane distances (Blais and Levine 1995). `camera` is that of the views, `noise_growth` that of
-    their depth (`SensorConfig`).
+    """Projective point-to-plane distances (Blais and Levine 1995). `camera` is that of the views, `noise_growth` that
+    of their depth (`SensorConfig`).
 
     Masked where the point is out of view, the image has no plane there, or the two are `reach` metres apart.
     """
