@@ -311,7 +311,9 @@ def code() -> str:
     """The state of `src/`, by which runs can be told apart; with a mark where it is not committed."""
     said = ("git", "-C", str(ROOT))
     changed = subprocess.run([*said, "diff", "--quiet", "HEAD", "--", "src"], check=False).returncode
-    named = subprocess.run([*said, "rev-parse", "--short", "HEAD:src"], stdout=subprocess.PIPE, text=True, check=True)
+    named = subprocess.run(
+        [*said, "rev-parse", "--short", "HEAD:src"], stdout=subprocess.PIPE, text=True, check=True
+    )
     return named.stdout.strip() + ("+" if changed else "")
 
 
@@ -357,8 +359,8 @@ COLUMNS = {
 PAGE = """# Held everywhere
 
 What holds the camera on sequences that nobody tuned on. Made by `python experiments/held.py --page` from `held.csv`
-beside it, which `python experiments/held.py` writes; what the columns mean is in its docstring. Default preset, each run
-held to one core; `code` is the state of `src/` in git, `git rev-parse --short COMMIT:src`.
+beside it, which `python experiments/held.py` writes; what the columns mean is in its docstring. Default preset, each
+run held to one core; `code` is the state of `src/` in git, `git rev-parse --short COMMIT:src`.
 """
 
 

@@ -102,7 +102,8 @@ def test_a_keyframe_of_two_submaps_is_at_one_place(found):
     first, second = state.submaps
     for number in (CHANGE - 1, CHANGE):
         one, other = (
-            s.T_world_sub @ next(k.T_sub_cam for k in s.keyframes if k.number == number) for s in (first, second)
+            s.T_world_sub @ next(k.T_sub_cam for k in s.keyframes if k.number == number)
+            for s in (first, second)
         )
         np.testing.assert_allclose(one, other, atol=1e-12)
     for s in state.submaps:

@@ -146,9 +146,7 @@ def _landmarks(pair: Pair, state: SlamState, cfg: Config) -> Landmarks | None:
     return landmarks([] if pair.seen is None else [pair.seen], 1, state.camera, cfg)
 
 
-def _pair_factors(
-    pairs: list[Pair], measured: relative.Relative, cfg: Config
-) -> Iterator[RelativePose]:
+def _pair_factors(pairs: list[Pair], measured: relative.Relative, cfg: Config) -> Iterator[RelativePose]:
     """Of pairs that corners or enough surfaces join."""
     order = [3, 4, 5, 0, 1, 2]  # of a tangent: that of the graph is (rotation, translation)
     for place, pair in enumerate(pairs):

@@ -101,7 +101,9 @@ def test_both_pull_alike_where_they_differ():
     first, second = see(HOME)[0], see(HOME @ MOTION)[0]
     elsewhere = MOTION @ pose((0.1, -0.05, 0.08), (0.003, 0.002, -0.002))
     found = measured(first, second, MOTION, corners(elsewhere, first))
-    surfaces, by_corners = (np.linalg.inv(part.astype(np.float64)) for part in (found.surfaces, found.corners))
+    surfaces, by_corners = (
+        np.linalg.inv(part.astype(np.float64)) for part in (found.surfaces, found.corners)
+    )
     difference = (surfaces + by_corners) @ found.pull
     # Towards the surfaces' pose from that of the corners: Cauchy weights bend it a little
     np.testing.assert_allclose(difference, slope(elsewhere, MOTION), atol=6e-4)

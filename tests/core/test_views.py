@@ -54,7 +54,9 @@ def test_distances_to_the_walls_are_exact(views, on_walls):
     for offset in (0.0, 0.02, -0.03):
         wall = np.abs(on_walls - WALLS).argmin(1)
         inward = INWARD[wall]
-        errors = plane_errors(views, jnp.asarray(on_walls + offset * inward, jnp.float32), CAMERA, REACH, EXACT)
+        errors = plane_errors(
+            views, jnp.asarray(on_walls + offset * inward, jnp.float32), CAMERA, REACH, EXACT
+        )
         assert errors.mask[0].mean() > 0.8 and errors.mask.shape == (3, len(on_walls))
         found = np.asarray(errors.distance)[np.asarray(errors.mask)]
         np.testing.assert_allclose(np.median(found), offset, atol=1e-4)

@@ -329,7 +329,8 @@ def test_an_agreeing_measurement_counts_in_full_however_robust():
     truth = ring(3)
     edges = [pose_edge(j, k, relative(truth, j, k), rng) for j, k in ((0, 1), (1, 2), (0, 2))]
     whole, robust = (
-        solve(truth, [edge._replace(robust=scale) for edge in edges], robust=False) for scale in (np.inf, 100.0)
+        solve(truth, [edge._replace(robust=scale) for edge in edges], robust=False)
+        for scale in (np.inf, 100.0)
     )
     # The Cauchy weight of a residual of two deviations is 0.9996
     assert_same_poses(robust.T_world_sub, whole.T_world_sub, 1e-5)

@@ -62,7 +62,9 @@ def test_the_difference_is_that_of_the_poses_alone(trust: float):
     np.testing.assert_allclose(np.linalg.inv(found.corners), corners, rtol=1e-6)
 
 
-@pytest.mark.parametrize("corners", [np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, 0]), np.full((6, 6), np.nan)])
+@pytest.mark.parametrize(
+    "corners", [np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, 0]), np.full((6, 6), np.nan)]
+)
 def test_corners_that_leave_something_open_say_nothing(corners):
     parts = np.zeros((4, 4)), np.eye(6), corners, np.ones(6), np.array(1.0)
     assert differing(Relative(*(part[None] for part in parts)), 0, 1.0) is None  # pyright: ignore[reportArgumentType]

@@ -228,9 +228,7 @@ Distances = list[tuple[Float[Array, "*K P"], Bool[Array, "*K P"]]]
 """For each part of the surfaces that points are measured against: of the points, and which of these are known."""
 
 
-def steady_hessian(
-    parts: list[Rows], moved: Callable[[Float[Array, "6"]], Distances]
-) -> Float[Array, "6 6"]:
+def steady_hessian(parts: list[Rows], moved: Callable[[Float[Array, "6"]], Distances]) -> Float[Array, "6 6"]:
     """The Hessian of these parts together, without what only the noise of normals makes of it; `moved` gives the
     distances after a twist."""
     hessian = sum(part.system().hessian for part in parts)

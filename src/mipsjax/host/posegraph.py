@@ -206,7 +206,9 @@ def _made(factor: Factor) -> gtsam.NoiseModelFactor:
         return _plane_factor(factor)
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
     if np.isfinite(factor.robust):
-        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(factor.robust), noise)
+        noise = gtsam.noiseModel.Robust.Create(
+            gtsam.noiseModel.mEstimator.Cauchy.Create(factor.robust), noise
+        )
     return gtsam.BetweenFactorPose3(factor.first, factor.second, _pose3(factor.T_first_second), noise)
 
 

@@ -40,7 +40,9 @@ class Differing(NamedTuple):
 
 def differing(measured: Relative, place: int, trust: float) -> Differing | None:
     """Of one of the pairs that were measured with this trust; None where corners alone do not hold it."""
-    surfaces, corners = (np.asarray(part[place], np.float64) for part in (measured.surfaces, measured.corners))
+    surfaces, corners = (
+        np.asarray(part[place], np.float64) for part in (measured.surfaces, measured.corners)
+    )
     if not (np.isfinite(surfaces).all() and np.isfinite(corners).all()):
         return None
     strength = np.linalg.eigvalsh(corners)
