@@ -11,7 +11,7 @@ hours: runs of which there is a row of the same code, the state of `src/` in git
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
 and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
 `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `colour`, corners
-switched off and on.
+switched off and on; `pairs`, keyframes not measured against each other after the last frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
@@ -104,13 +104,16 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
         return [Task(group, "redkitchen", stride, seed=seed) for stride, seed in strides]
     if group == "blind":
         return [Task(group, name, switch="flat", seed=seed) for name, seed in product(large, seeds)]
+    if group == "pairs":
+        names = (("bookstore", 1), ("corridor_walk", 1), ("small_house/living", 1), ("redkitchen", 8))
+        return [Task(group, *name, switch="no-pairs", seed=seed) for name, seed in product(names, seeds)]
     assert group == "colour"
     real = (("redkitchen", 4), ("rgbd_dataset_freiburg3_excerpt", 1))
     switches = product(real, ("full", "no-corners"), seeds)
     return [Task(group, name, stride, switch, seed) for (name, stride), switch, seed in switches]
 
 
-GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour")
+GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour", "pairs")
 
 
 class Flat:
@@ -132,7 +135,9 @@ class Flat:
 
 def configuration(switch: str) -> Config:
     cfg = preset("default")
-    return changed(cfg, "track.corners", count=0) if switch == "no-corners" else cfg
+    if switch == "no-corners":
+        return changed(cfg, "track.corners", count=0)
+    return changed(cfg, "pairs", before=0, others=0, oldest=0) if switch == "no-pairs" else cfg
 
 
 def done(task: Task) -> dict[str, Any]:

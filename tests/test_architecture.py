@@ -21,7 +21,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"host", "data", "policy", "schedule"}),
     frozenset({"state", "rest"}),
     frozenset({"bundle", "landmarks", "links"}),
-    frozenset({"territory", "background", "surfaces", "tracker"}),
+    frozenset({"territory", "background", "surfaces", "straighten", "tracker"}),
     frozenset({"closure"}),
     frozenset({"recovery"}),
     frozenset({"slam", "final", "judge"}),

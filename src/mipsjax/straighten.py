@@ -22,10 +22,11 @@ from mipsjax.core import relative
 from mipsjax.core.solvers import Landmarks
 from mipsjax.host.corners import follow
 from mipsjax.host.factors import RelativePose
+from mipsjax.host.metrics import angles
 from mipsjax.host.trust import differing, trusted
 from mipsjax.landmarks import Seen, landmarks
 from mipsjax.links import joined
-from mipsjax.state import Keyframe, Pose, SlamState, distance, inverse, rigid
+from mipsjax.state import Keyframe, Pose, SlamState, inverse, rigid
 
 log = logging.getLogger(__name__)
 
@@ -55,12 +56,13 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     Submaps that nothing joins to the first stay where they are.
     """
     numbers, nodes = _keyframes(state)
-    if not cfg.pairs.wanted or len(nodes) < 2:
-        return state, 1.0
     poses = np.stack([T for _, T in nodes])
     pairs = [_followed(nodes, *places, state, cfg) for places in _near(poses, cfg)]
+    if not pairs:
+        return state, 1.0
     measured = _measured(nodes, pairs, 1.0, state, cfg)
-    trust = trusted([d for place in range(len(pairs)) if (d := differing(measured, place, 1.0)) is not None])
+    differences = [differing(measured, place, 1.0) for place in range(len(pairs))]
+    trust = trusted([difference for difference in differences if difference is not None])
     if trust < 1:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
@@ -98,12 +100,13 @@ def _near(poses: Float64[np.ndarray, "N 4 4"], cfg: Config) -> Iterator[tuple[in
     """Places of the keyframes that are measured against each other, the earlier one first."""
     wanted = cfg.pairs
     for second in range(1, len(poses)):
-        apart = np.array([distance(poses[first], poses[second]) for first in range(second)])
-        within = np.flatnonzero((apart[:, 0] < wanted.translation) & (apart[:, 1] < wanted.rotation))
+        shift = np.linalg.norm(poses[:second, :3, 3] - poses[second, :3, 3], axis=1)
+        turn = angles(poses[:second, :3, :3].swapaxes(1, 2) @ poses[second, :3, :3])
+        within = np.flatnonzero((shift < wanted.translation) & (turn < wanted.rotation))
         chosen = within[within >= second - wanted.before]
         rest = within[within < second - wanted.before]
         # A radian is as far as a metre, as elsewhere
-        nearest = rest[np.argsort(apart[rest].sum(axis=1), kind="stable")][: wanted.others]
+        nearest = rest[np.argsort((shift + turn)[rest], kind="stable")][: wanted.others]
         oldest = np.setdiff1d(rest, nearest)[: wanted.oldest]
         for first in sorted({*chosen.tolist(), *nearest.tolist(), *oldest.tolist()}):
             yield first, second
