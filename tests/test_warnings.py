@@ -64,7 +64,9 @@ def test_one_that_means_a_wrong_result_is_an_error_from_anywhere(
 
 def silent(*arguments: str, folder: Path) -> None:
     """Runs Python as a user does, with its own filters, and checks that nothing is said on standard error."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"}
+    # JAX, which the tests import before mipsjax, sets the second for this process
+    own = ("PYTHONWARNINGS", "TF_CPP_MIN_LOG_LEVEL")
+    environment = {name: value for name, value in os.environ.items() if name not in own}
     cache = jax.config.jax_compilation_cache_dir
     if cache:  # library callers choose one by these, too
         environment["JAX_COMPILATION_CACHE_DIR"] = cache

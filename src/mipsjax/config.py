@@ -313,8 +313,9 @@ class HeldConfig:
     """m/s^2, standard deviation of a camera's, where nothing else says how it moves."""
     turn: float = 6.0
     """rad/s^2, the same."""
-    weak: float = 0.04
-    """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation."""
+    weak: float = 0.03
+    """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation.
+    Along a bare corridor noise alone seems to hold a frame by 0.03 to 0.07."""
 
 
 @dataclass(frozen=True)

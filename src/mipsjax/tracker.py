@@ -13,12 +13,13 @@ from mipsjax.bundle import TRACK, nearest, random_key, views_of
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.data.sequence import Frame
-from mipsjax.host.held import NONE, Directions, Held, Matrix, adjoint, at, directions, held, predicted
+from mipsjax.host.held import NONE, Directions, Held, Matrix, at, directions, held, of_turns, predicted
 from mipsjax.landmarks import Seen, follow_all, landmarks
 from mipsjax.policy import Status, converged, widening
-from mipsjax.state import Keyframe, Pose, Record, SlamState, distance, last_pose, rigid
+from mipsjax.state import Keyframe, Pose, Record, SlamState, deviations_of, distance, last_pose, rigid
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
+SURE_M = 0.1  # standard deviation of where the camera is up to which it is surely beside the keyframes that seem near
 TRUSTED = (Status.OK, Status.WEAK)
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
@@ -64,17 +65,20 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     )
     T, info = jax.device_get((T, info))
     surfaces, corners = _information(info, cfg)
-    reference = min((keyframe.covariance for keyframe in near), key=np.trace)
-    T_sub_cam, together = rigid(T), directions(surfaces + corners)
+    reference, information = _reference(state, near), surfaces + corners
+    together = directions(information)
+    T_sub_cam = _carried_on(rigid(T), candidates[0], together, cfg)
     expected = _predicted(reference, state, frame, T_sub_cam, cfg)
-    T_sub_cam = _carried_on(T_sub_cam, candidates[0], together, expected, cfg)
+    if together.deviation[-1] > cfg.track.held.weak:
+        # What seems to hold a weak frame may be noise, the same in each frame, of which many would make a firm hold
+        information = of_turns(information)
     return Tracked(
         T_sub_cam,
         info,
         found,
         directions(surfaces),
         together,
-        held(reference, expected, T_sub_cam, surfaces + corners),
+        held(reference, expected, T_sub_cam, information),
         1e3 * (perf_counter() - began),
     )
 
@@ -94,6 +98,18 @@ def _predicted(reference: Matrix, state: SlamState, frame: Frame, T_sub_cam: Pos
     return predicted(reference, last.held, T_sub_cam, seconds, cfg.track.held)
 
 
+def _reference(state: SlamState, near: list[Keyframe]) -> Matrix:
+    """What the pose is off by that a frame is measured against.
+
+    That is the best known keyframe nearby, as long as the camera itself is known to `SURE_M`. Otherwise it may be
+    elsewhere, and what it fits is what the map has learned of the frame before, a moment ago.
+    """
+    metres, _ = deviations_of(state, state.records[-1])
+    if metres > SURE_M:
+        return state.records[-1].held.covariance
+    return min((keyframe.covariance for keyframe in near), key=np.trace)
+
+
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
     """Of surfaces and of corners, as if those that err together were one; none of a frame that is not finite."""
     wanted = cfg.track.held
@@ -103,21 +119,18 @@ def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]
     return surfaces, corners
 
 
-def _carried_on(T_sub_cam: Pose, T_expected: Pose, together: Directions, expected: Held, cfg: Config) -> Pose:
-    """Along directions that nothing holds, as far as the expected motion is known better than what was measured."""
+def _carried_on(T_sub_cam: Pose, T_expected: Pose, together: Directions, cfg: Config) -> Pose:
+    """Along directions that nothing holds, where it was expected."""
     motion = np.linalg.inv(T_expected) @ T_sub_cam
     # To first order a twist: what is left open is a shift, or a small turn
     off = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
-    back = adjoint(np.linalg.inv(T_sub_cam))
-    prior = back @ expected.covariance @ back.T
-    twist = np.zeros(6)
-    for deviation, direction in zip(together.deviation, together.twist, strict=True):
-        if deviation > cfg.track.held.weak:
-            share = 1 / (1 + (direction @ prior @ direction) / deviation**2)
-            twist -= share * (direction @ off) * direction
+    open_ones = together.twist[together.deviation > cfg.track.held.weak]
+    if not len(open_ones):
+        return T_sub_cam
+    twist = -open_ones.T @ (open_ones @ off)
     change = np.eye(4)
     change[:3, :3], change[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
-    return T_sub_cam @ change if twist.any() else T_sub_cam
+    return T_sub_cam @ change
 
 
 def _near(state: SlamState, cfg: Config) -> list[Keyframe]:

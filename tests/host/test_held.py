@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from mipsjax.config import HeldConfig
 from mipsjax.host.held import (
     EXACT,
+    LASTING,
     MOVING,
     NONE,
     OPEN,
@@ -21,6 +22,7 @@ from mipsjax.host.held import (
     difference,
     directions,
     held,
+    of_turns,
     predicted,
 )
 from painted import pose
@@ -29,6 +31,8 @@ CFG = HeldConfig()
 T = pose((20, -40, 70), (1.0, -2.0, 3.0))
 STILL = np.eye(4)
 SECONDS = 1 / 30
+WHITE = CFG.acceleration * np.sqrt(2 * LASTING / SECONDS)
+"""m/s^2: accelerations by chance in each frame that do as much as one that lasts."""
 FIRM = np.diag([1 / 0.002**2] * 3 + [1 / 0.001**2] * 3)
 
 
@@ -61,7 +65,7 @@ def test_a_frame_that_is_measured_is_as_good_as_its_measurement_and_its_keyframe
 def test_what_nothing_holds_strays_as_chance_makes_it():
     """A second of accelerations by chance, from a motion that is hardly known; whatever the keyframe is off by."""
     rng, frames = np.random.default_rng(0), 30
-    changes = CFG.acceleration * SECONDS**2 * rng.standard_normal((4000, frames, 3))
+    changes = WHITE * SECONDS**2 * rng.standard_normal((4000, frames, 3))
     motion = MOVING * rng.standard_normal((4000, 1, 3)) + changes.cumsum(1)
     strayed = motion.sum(1).std(0)
     for common in (NONE, np.diag([0.1] * 6) ** 2):
@@ -85,9 +89,20 @@ def test_a_slide_grows_as_chance_makes_it_whatever_keyframes_it_is_measured_agai
         last = step(last, blind, reference)
         if place % every == 0:
             reference = last.covariance
-    exact = CFG.acceleration * SECONDS**2 * np.sqrt(60**3 / 3)
+    exact = WHITE * SECONDS**2 * np.sqrt(60**3 / 3)
     assert 0.1 * exact < np.sqrt(last.covariance[0, 0]) < 2 * exact
     assert np.linalg.eigvalsh(last.joint)[0] > -1e-9
+
+
+def test_turns_are_known_whatever_the_shift_is():
+    """As where a shift of any length is allowed for."""
+    root = np.random.default_rng(3).normal(size=(6, 6))
+    information = root @ root.T + np.eye(6)
+    free = np.linalg.inv(information)
+    free[:3, :3] += 1e9 * np.eye(3)
+    np.testing.assert_allclose(of_turns(information), np.linalg.inv(free), rtol=1e-5, atol=1e-5)
+    bare = np.diag([0.0, 0, 1, 1, 1, 0])
+    np.testing.assert_allclose(of_turns(bare), np.diag([0.0, 0, 0, 1, 1, 0]), atol=1e-12)
 
 
 def test_a_direction_that_is_measured_again_is_good_again():

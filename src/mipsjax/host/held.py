@@ -42,6 +42,8 @@ MOVING = 0.05
 """Metres, or rad, that a camera of which nothing is known may move between two frames, along each axis."""
 ROUNDING = 1e-9
 """Of a standard deviation, relative to the largest, and of that in metres or rad: what is less is none."""
+LASTING = 0.3
+"""Seconds for which a camera goes on accelerating as it does."""
 LONGEST = 1.0
 """Seconds: over a longer gap acceleration says nothing more."""
 
@@ -62,6 +64,14 @@ def directions(information: Matrix) -> Directions:
     return Directions(1 / np.sqrt(np.maximum(strength[::-1], least)), twists.T[::-1])
 
 
+def of_turns(information: Matrix) -> Matrix:
+    """What is left of an inverse covariance where nothing is said of shifts: of turns, whatever the shift is."""
+    shifts, both = information[:3, :3], information[:3, 3:]
+    out = np.zeros((6, 6))
+    out[3:, 3:] = information[3:, 3:] - both.T @ np.linalg.pinv(shifts, hermitian=True) @ both
+    return out
+
+
 def at(covariance: Matrix, T_sub_cam: Pose) -> Held:
     """Of a frame whose pose is known this well, and whose motion is not."""
     joint = np.zeros((12, 12))
@@ -78,7 +88,10 @@ def predicted(reference: Matrix, last: Held, T_sub_cam: Pose, seconds: float, cf
     covariance, cross, motion = last.joint[:6, :6], last.joint[:6, 6:], last.joint[6:, 6:]
     since = difference(covariance, reference)
     cross = _bounded(cross, since, motion)
-    axes = np.repeat([cfg.acceleration, cfg.turn], 3) * min(seconds, LONGEST) ** 2
+    seconds = min(seconds, LONGEST)
+    # White noise that does as much over a while as an acceleration that lasts
+    lasting = np.sqrt(max(2 * LASTING / seconds, 1.0))
+    axes = np.repeat([cfg.acceleration, cfg.turn], 3) * lasting * seconds**2
     on = np.block([[np.eye(6), np.eye(6)], [NONE, np.eye(6)]])
     joint = on @ np.block([[since, cross], [cross.T, motion]]) @ on.T
     return Held(_positive(joint + np.tile(carried(np.diag(axes**2), T_sub_cam), (2, 2))))
