@@ -145,6 +145,25 @@ def test_one_pair_that_is_wrong_is_outvoted(monkeypatch):
     assert metres < 3 * EXACT_M
 
 
+def test_a_loop_stays_closed_where_its_keyframes_are_too_far_apart_for_a_pair():
+    """The last keyframe was registered in the first submap; what lies between slid by half a metre in one place."""
+    tracked = [*PATH[:CHANGE], *(pose((0, 0, 0), (0.5, 0, 0)) @ T for T in PATH[CHANGE:])]
+    state = travelled(tracked, corners=False)
+    first, second = state.submaps
+    seen = keyframe(COUNT - 1, PATH[COUNT - 1], corners=False)
+    state = state._replace(submaps=(first, second._replace(parent=None))).with_submap(
+        0, keyframes=(*first.keyframes, seen)
+    )
+    surfaces = replace(
+        CFG,
+        pairs=replace(CFG.pairs, before=1, others=0, oldest=0),
+        track=TrackConfig(corners=CornerConfig(count=0)),
+    )
+    moved, _ = straightened(state, surfaces)
+    metres, _ = distance(PATH[COUNT - 1], world_pose(moved, moved.records[-1]))
+    assert distance(PATH[COUNT - 1], tracked[-1])[0] > 0.4 and metres < 0.1
+
+
 def test_a_submap_that_nothing_joins_stays_and_so_does_a_run_that_wants_no_pairs():
     state = travelled(drifted())
     lonely = submap([5, 6], drifted(), True, None)._replace(T_world_sub=pose((0, 90, 0), (9, 0, 0)))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
+from mipsjax.bundle import nearest
 from mipsjax.config import Config
 from mipsjax.core import relative
 from mipsjax.core.solvers import Landmarks
@@ -67,6 +68,7 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
     factors += _as_tracked(poses, {factor.second for factor in factors}, cfg)
+    factors += _link_factors(state, numbers, cfg)
     from mipsjax.host.posegraph import solve  # gtsam takes a second to load, and may not be needed
 
     solved = solve(poses, factors, robust=False)
@@ -171,6 +173,29 @@ def _as_tracked(poses: Float64[np.ndarray, "N 4 4"], joined: set[int], cfg: Conf
     for second in sorted(set(range(1, len(poses))) - joined):
         between = inverse(poses[second - 1]) @ poses[second]
         yield RelativePose(second - 1, second, between, cfg.loop.sigma_rotation, cfg.loop.sigma)
+
+
+def _link_factors(state: SlamState, numbers: list[int], cfg: Config) -> Iterator[RelativePose]:
+    """Of frames that were registered in another submap, beside its keyframe that is nearest to them: a loop that was
+    closed stays closed where its keyframes are too far apart for a pair."""
+    places = {number: place for place, number in enumerate(numbers)}
+    for submap in sorted(joined(state, 0)):
+        keyframes = state.submaps[submap].keyframes
+        own = [k for k in keyframes if state.records[k.number].submap == submap]
+        for keyframe in keyframes:
+            tracked = state.records[keyframe.number].submap
+            begun = tracked == state.submaps[submap].parent or state.submaps[tracked].parent == submap
+            if tracked == submap or begun or not own:
+                continue
+            (beside,) = nearest(own, keyframe.T_sub_cam, 1)
+            yield RelativePose(
+                places[beside.number],
+                places[keyframe.number],
+                inverse(beside.T_sub_cam) @ keyframe.T_sub_cam,
+                cfg.loop.sigma_rotation,
+                cfg.loop.sigma,
+                robust=cfg.pairs.robust,
+            )
 
 
 def _moved(state: SlamState, T_world_cam: dict[int, Pose]) -> SlamState:
