@@ -11,7 +11,7 @@ hours: runs of which there is a row of the same code, the state of `src/` in git
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
 and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
 `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `colour`, corners
-switched off and on; `pairs`, keyframes not measured against each other after the last frame.
+switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
@@ -66,6 +66,7 @@ OFF_M = 0.3
 FLAT = 128
 """Grey of an image that shows nothing."""
 RESULTS = ROOT / "docs"
+UNKNOWN = "+"
 TEST_HOMES, TUNING_HOMES = range(1, 11), range(101, 111)
 
 
@@ -104,7 +105,7 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
         return [Task(group, "redkitchen", stride, seed=seed) for stride, seed in strides]
     if group == "blind":
         return [Task(group, name, switch="flat", seed=seed) for name, seed in product(large, seeds)]
-    if group == "pairs":
+    if group == "no-pairs":
         names = (("bookstore", 1), ("corridor_walk", 1), ("small_house/living", 1), ("redkitchen", 8))
         return [Task(group, *name, switch="no-pairs", seed=seed) for name, seed in product(names, seeds)]
     assert group == "colour"
@@ -113,7 +114,7 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
     return [Task(group, name, stride, switch, seed) for (name, stride), switch, seed in switches]
 
 
-GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour", "pairs")
+GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour", "no-pairs")
 
 
 class Flat:
@@ -164,11 +165,14 @@ def surface(state: SlamState, observed: Path, cfg: Config) -> dict[str, Any]:
         return {}
     with np.load(observed) as file:
         true = file["q"].T * file["step"] + file["origin"]
-    sampled, _ = trimesh.sample.sample_surface(reconstruct(state, cfg), SAMPLES, seed=0)
+    mesh = reconstruct(state, cfg)
+    if mesh.is_empty:
+        return {"completion": 0.0}
+    sampled, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     off, missing = KDTree(true).query(sampled)[0], KDTree(sampled).query(true)[0]
     near = off <= FAR_M
     return {
-        "accuracy_cm": 100 * float(off[near].mean()),
+        "accuracy_cm": 100 * float(off[near].mean()) if near.any() else float("nan"),
         "left_out": float(np.mean(~near)),
         "completion": float(np.mean(missing <= NEAR_M)),
     }
@@ -291,7 +295,8 @@ def in_a_process(task: Task, core: int) -> dict[str, Any]:
 def all_of(wanted: list[Task], workers: int, again: bool) -> None:
     """All runs, as many at a time as there are workers, each on a core of its own; replaces rows of the same runs."""
     rows, now = {_key(row): row for row in _read()}, code()
-    known = {key for key, row in rows.items() if row["code"] == now and not row.get("failed")}
+    same = {key for key, row in rows.items() if row.get("code") == now and not row.get("failed")}
+    known = set() if now.endswith(UNKNOWN) else same
     wanted = [task for task in wanted if again or _key(task._asdict()) not in known]
     cores: SimpleQueue[int] = SimpleQueue()
     for core in sorted(os.sched_getaffinity(0))[:workers]:
@@ -313,13 +318,13 @@ def all_of(wanted: list[Task], workers: int, again: bool) -> None:
 
 
 def code() -> str:
-    """The state of `src/`, by which runs can be told apart; with a mark where it is not committed."""
-    said = ("git", "-C", str(ROOT))
-    changed = subprocess.run([*said, "diff", "--quiet", "HEAD", "--", "src"], check=False).returncode
-    named = subprocess.run(
-        [*said, "rev-parse", "--short", "HEAD:src"], stdout=subprocess.PIPE, text=True, check=True
-    )
-    return named.stdout.strip() + ("+" if changed else "")
+    """The state of `src/`, by which runs can be told apart; with `UNKNOWN` at its end where it is not committed."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+    return git("rev-parse", "--short", "HEAD:src") + (UNKNOWN if git("status", "--porcelain", "src") else "")
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -356,6 +361,7 @@ COLUMNS = {
     "near_change_mm": "near a change, mm",
     "elsewhere_mm": "elsewhere, mm",
     "accuracy_cm": "accuracy, cm",
+    "left_out": "left out of it",
     "completion": "completion at 5 cm",
     "fps_online": "frames/s of one core",
     "code": "code",

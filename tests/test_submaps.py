@@ -215,22 +215,43 @@ def test_nothing_compiles_after_the_first_frames(frames, sequence, meeting):
     assert factor is not None and not compiled
 
 
-def test_finish_solves_the_graph_by_finished_fields_before_it_aligns_the_frames(states, monkeypatch):
-    before, moved_to, seen = states[-1], maps.pose(translation=(1.0, 0.0, 0.0)), []
+def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(states, monkeypatch):
+    before, moved_to, given, firm = states[-1], maps.pose(translation=(1.0, 0.0, 0.0)), [], []
+    real = final.tracking.align
 
     def closed_again(state: SlamState, cfg: Config) -> SlamState:
-        seen.append(state)
+        given.append(state)
         return state.with_submap(1, T_world_sub=moved_to)
 
+    def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
+        given.append(state)
+        return state, 0.25
+
+    def align(field, depth, T, corners, *others):
+        firm.append(corners)
+        return real(field, depth, T, corners, *others)
+
     monkeypatch.setattr(final, "closed_again", closed_again)
+    monkeypatch.setattr(final, "straightened", straightened)
+    monkeypatch.setattr(final.tracking, "align", align)
     after = finish(before, CFG)
-    (given,) = seen
-    for old, new in zip(before.submaps, given.submaps, strict=True):
-        assert old.learned.field is not new.learned.field
-    poses = [np.stack([r.T_keyframe_cam for r in state.records]) for state in (before, given, after)]
+    first, second = given
+    for old, still, new in zip(before.submaps, second.submaps, after.submaps, strict=True):
+        assert old.learned.field is still.learned.field is not new.learned.field
+    np.testing.assert_array_equal(first.submaps[1].T_world_sub, before.submaps[1].T_world_sub)
+    for state in (second, after):
+        np.testing.assert_array_equal(state.submaps[1].T_world_sub, moved_to)
+    poses = [np.stack([r.T_keyframe_cam for r in state.records]) for state in (before, second, after)]
     np.testing.assert_array_equal(poses[1], poses[0])
     assert (poses[2] != poses[0]).any()
-    np.testing.assert_array_equal(after.submaps[1].T_world_sub, moved_to)
+    # Corners hold a frame there as far as they were found right
+    held = np.stack([r.corners for r in before.records if r.submap == 0 and r.depth is not None])
+    np.testing.assert_allclose(firm[0][: len(held)], 0.25 * held[: len(firm[0])], rtol=1e-6)
+
+
+def test_keyframes_stay_where_nothing_is_learned_there(states, monkeypatch):
+    monkeypatch.setattr(final, "straightened", None)
+    finish(states[-1], replace(CFG, map=replace(CFG.map, final_steps=0)))
 
 
 def test_surfaces_of_two_submaps_measure_how_they_lie(meeting, sequence):

@@ -9,7 +9,9 @@ import maps
 from mipsjax.config import Config
 from mipsjax.core.tracking import TrackInfo
 from mipsjax.data.sequence import Frame
+from mipsjax.host.corners import Corners
 from mipsjax.host.held import NONE, Directions, at
+from mipsjax.landmarks import Seen
 from mipsjax.policy import Status
 from mipsjax.state import SlamState
 from mipsjax.tracker import _carried_on, _information, _reference, coasting
@@ -29,15 +31,22 @@ def test_along_what_nothing_holds_a_frame_goes_on_as_expected(open_m, followed):
 
 
 def test_a_camera_that_may_be_elsewhere_is_measured_against_the_frame_before():
-    """Not against a keyframe that only seems near, which would make it well known again."""
+    """Not against a keyframe that only seems near, unless its corners are seen or the frame before taught nothing."""
     loose = 0.05**2 * np.eye(6)
     sure, unsure = (at(metres**2 * np.eye(6), np.eye(4)) for metres in (0.03, 0.5))
     keyframes = [maps.keyframe(0), maps.keyframe(1)._replace(covariance=loose)]
     state: SlamState = maps.state(maps.submap(*keyframes))
-    for held, expected in ((sure, NONE), (unsure, unsure.covariance)):
-        record = state.records[-1]._replace(held=held)
-        found = _reference(state._replace(records=(record,)), keyframes)
-        np.testing.assert_array_equal(found, expected)
+    reference = Corners(1, *[np.zeros(0)] * 5)  # pyright: ignore[reportArgumentType]
+    seen = Seen(reference, np.eye(4), None)  # pyright: ignore[reportArgumentType]
+    for held, status, found, expected in (
+        (sure, Status.OK, [], NONE),
+        (unsure, Status.OK, [], unsure.covariance),
+        (unsure, Status.OK, [seen], loose),
+        (unsure, Status.SKIPPED, [], NONE),
+    ):
+        record = state.records[-1]._replace(held=held, status=status)
+        there = _reference(state._replace(records=(record,)), keyframes, found)
+        np.testing.assert_array_equal(there, expected)
 
 
 def test_a_camera_that_nobody_sees_may_be_anywhere_soon():

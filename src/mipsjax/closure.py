@@ -120,8 +120,8 @@ def _closed(state: SlamState, loops: list[Found], cfg: Config) -> SlamState:
 
 
 def closed_again(state: SlamState, cfg: Config) -> SlamState:
-    """After the last frame: all keyframes are looked up once more, and the pose graph is solved by all links and by
-    finished surfaces, if it says more than which submap was begun from which."""
+    """After the last frame: all keyframes are looked up once more, and the pose graph is solved by all links and
+    surfaces, if it says more than which submap was begun from which."""
     if not cfg.loop.enabled:
         return state
     state, found = _looked_up(state, cfg) if cfg.loop.features else (state, [])

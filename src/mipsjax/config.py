@@ -338,14 +338,15 @@ class TrackConfig:
 @dataclass(frozen=True)
 class PairConfig:
     """Keyframes measured against each other after the last frame, by corners and depth images of both and by no map:
-    what says that a submap has turned or bent within itself. Not in the paper."""
+    what says that a submap has turned or bent within itself. Only where `map.final_steps` learn the map there; not at
+    all where `before`, `others` and `oldest` are 0. Not in the paper."""
 
     before: int = 3
     """Keyframes just before each one that it is measured against."""
     others: int = 3
     """Earlier ones beside these, the nearest."""
     oldest: int = 3
-    """Earlier ones beside these, the oldest: they hold what has drifted since. With all three 0 no poses are moved."""
+    """Earlier ones beside these, the oldest: they hold what has drifted since."""
     translation: float = 1.0
     """Metres between the poses of two keyframes that may see the same."""
     rotation: float = 0.7

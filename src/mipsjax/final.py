@@ -29,7 +29,8 @@ def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamSt
     `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor`
     is the one that `step` was given. Warns where submaps hang on nothing."""
     state = closed_again(taken_over(state, executor), cfg)
-    state, trust = straightened(state, cfg)
+    # Where submaps do not learn once more they stay bent, and so do the keyframes in them
+    state, trust = straightened(state, cfg) if cfg.map.final_steps else (state, 1.0)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":

@@ -24,7 +24,7 @@ from mipsjax.core.solvers import Landmarks
 from mipsjax.host.corners import follow
 from mipsjax.host.factors import RelativePose
 from mipsjax.host.metrics import angles
-from mipsjax.host.trust import differing, trusted
+from mipsjax.host.trust import MATCHED, differing, trusted
 from mipsjax.landmarks import Seen, landmarks
 from mipsjax.links import joined
 from mipsjax.state import Keyframe, Pose, SlamState, inverse, rigid
@@ -33,10 +33,15 @@ log = logging.getLogger(__name__)
 
 GROUP = 16
 """Pairs that are measured in one call."""
-MATCHED = 0.3
-"""Least share of the later frame's points on surfaces of the earlier one, where no corners join the two."""
 SIGMA_M, SIGMA_RAD = 0.001, 0.0005
 """Of a measured pair, beside what it states: two images of one place err together."""
+
+
+class Node(NamedTuple):
+    """One keyframe, whatever submaps it is of."""
+
+    keyframe: Keyframe
+    T_world_cam: Pose
 
 
 class Pair(NamedTuple):
@@ -56,46 +61,51 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
 
     Submaps that nothing joins to the first stay where they are.
     """
-    numbers, nodes = _keyframes(state)
-    poses = np.stack([T for _, T in nodes])
+    nodes = _keyframes(state)
+    numbers = [node.keyframe.number for node in nodes]
+    poses = np.stack([node.T_world_cam for node in nodes])
     pairs = [_followed(nodes, *places, state, cfg) for places in _near(poses, cfg)]
     if not pairs:
         return state, 1.0
     measured = _measured(nodes, pairs, 1.0, state, cfg)
-    differences = [differing(measured, place, 1.0) for place in range(len(pairs))]
+    differences = [differing(measured, number) for number in range(len(pairs))]
     trust = trusted([difference for difference in differences if difference is not None])
     if trust < 1:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
     factors += _as_tracked(poses, {factor.second for factor in factors}, cfg)
     factors += _link_factors(state, numbers, cfg)
+    solved = _solved(poses, factors)
+    if solved is None:
+        return state, trust
+    log.info("%d keyframes in %d pairs; corners are trusted by %.2g", len(nodes), len(pairs), trust)
+    return _moved(state, dict(zip(numbers, solved, strict=True))), trust
+
+
+def _solved(
+    poses: Float64[np.ndarray, "N 4 4"], factors: list[RelativePose]
+) -> Float64[np.ndarray, "N 4 4"] | None:
+    """Where the keyframes lie by all of it; None, with a warning, where no solution is found."""
     from mipsjax.host.posegraph import solve  # gtsam takes a second to load, and may not be needed
 
     solved = solve(poses, factors, robust=False)
-    moved = np.linalg.norm(solved.T_world_sub[:, :3, 3] - poses[:, :3, 3], axis=1)
-    log.info(
-        "%d keyframes measured in %d pairs, corners trusted by %.2g, moved by %.1f cm at most",
-        len(nodes),
-        len(pairs),
-        trust,
-        100 * moved.max(),
-    )
-    return _moved(state, dict(zip(numbers, solved.T_world_sub, strict=True))), trust
+    if not solved.ok:
+        log.warning("keyframes could not be moved to where they lie by each other: they stay as tracked")
+        return None
+    return solved.T_world_sub
 
 
-def _keyframes(state: SlamState) -> tuple[list[int], list[tuple[Keyframe, Pose]]]:
+def _keyframes(state: SlamState) -> list[Node]:
     """All that are joined to the first submap, in the order of their numbers: each once, as the submap has it in which
-    it was tracked, and its pose in the world."""
-    places = joined(state, 0)
-    found = {}
-    for place in places:
+    it was tracked."""
+    found: dict[int, Node] = {}
+    for place in joined(state, 0):
         submap = state.submaps[place]
         for keyframe in submap.keyframes:
-            own = state.records[keyframe.number].submap == place
-            if own or keyframe.number not in found:
-                found[keyframe.number] = keyframe, submap.T_world_sub @ keyframe.T_sub_cam
-    numbers = sorted(found)
-    return numbers, [found[number] for number in numbers]
+            tracked_here = state.records[keyframe.number].submap == place
+            if tracked_here or keyframe.number not in found:
+                found[keyframe.number] = Node(keyframe, submap.T_world_sub @ keyframe.T_sub_cam)
+    return [found[number] for number in sorted(found)]
 
 
 def _near(poses: Float64[np.ndarray, "N 4 4"], cfg: Config) -> Iterator[tuple[int, int]]:
@@ -114,31 +124,38 @@ def _near(poses: Float64[np.ndarray, "N 4 4"], cfg: Config) -> Iterator[tuple[in
             yield first, second
 
 
-def _followed(
-    nodes: list[tuple[Keyframe, Pose]], first: int, second: int, state: SlamState, cfg: Config
-) -> Pair:
+def _followed(nodes: list[Node], first: int, second: int, state: SlamState, cfg: Config) -> Pair:
     """Two keyframes, with the corners of the first that the second shows."""
-    (one, T_world_one), (other, T_world_other) = nodes[first], nodes[second]
-    guess = inverse(T_world_one) @ T_world_other
-    if one.corners is None or other.corners is None:
-        return Pair(first, second, guess, None)
-    fewest = cfg.track.corners.fewest
-    followed = follow(one.corners, other.corners.grey, guess, fewest, state.camera, near=True)
-    seen = None if followed is None else Seen(one.corners, np.eye(4), followed)
-    return Pair(first, second, guess if seen is None else seen.T_sub_cam, seen)
+    one, other = nodes[first], nodes[second]
+    T_first_second = inverse(one.T_world_cam) @ other.T_world_cam
+    corners, later = one.keyframe.corners, other.keyframe.corners
+    if corners is None or later is None:
+        return Pair(first, second, T_first_second, None)
+    followed = follow(
+        corners,
+        later.grey,
+        T_first_second,
+        cfg.track.corners.fewest,
+        state.camera,
+        near=second - first <= cfg.pairs.before,  # farther back they may have drifted
+    )
+    seen = None if followed is None else Seen(corners, np.eye(4), followed)
+    return Pair(first, second, T_first_second, seen)
 
 
 def _measured(
-    nodes: list[tuple[Keyframe, Pose]], pairs: list[Pair], trust: float, state: SlamState, cfg: Config
+    nodes: list[Node], pairs: list[Pair], trust: float, state: SlamState, cfg: Config
 ) -> relative.Relative:
     """What all pairs say, a fixed number of them in each call."""
     found = []
     for begin in range(0, len(pairs), GROUP):
         group = pairs[begin : begin + GROUP]
         filled = [group[i % len(group)] for i in range(GROUP)]
+        starts = [pair.T_first_second if pair.seen is None else pair.seen.T_sub_cam for pair in filled]
         given = relative.Pairs(
-            jnp.asarray(np.stack([nodes[pair.first][0].depth for pair in filled])),
-            jnp.asarray(np.stack([nodes[pair.second][0].depth for pair in filled])),
+            jnp.asarray(np.stack([nodes[pair.first].keyframe.depth for pair in filled])),
+            jnp.asarray(np.stack([nodes[pair.second].keyframe.depth for pair in filled])),
+            jnp.asarray(np.stack(starts), jnp.float32),
             jnp.asarray(np.stack([pair.T_first_second for pair in filled]), jnp.float32),
             jax.tree.map(lambda *parts: jnp.stack(parts), *(_landmarks(pair, state, cfg) for pair in filled)),
         )
@@ -154,23 +171,30 @@ def _landmarks(pair: Pair, state: SlamState, cfg: Config) -> Landmarks | None:
 def _pair_factors(pairs: list[Pair], measured: relative.Relative, cfg: Config) -> Iterator[RelativePose]:
     """Of pairs that corners or enough surfaces join."""
     order = [3, 4, 5, 0, 1, 2]  # of a tangent: that of the graph is (rotation, translation)
-    for place, pair in enumerate(pairs):
-        T, matched = np.asarray(measured.T_first_second[place]), float(measured.matched[place])
-        information = np.asarray(measured.surfaces[place] + measured.corners[place], np.float64)
-        if not (np.isfinite(T).all() and np.isfinite(information).all()):
-            continue
-        if pair.seen is None and matched < MATCHED:
+    for number, pair in enumerate(pairs):
+        T_first_second = np.asarray(measured.T_first_second[number])
+        information = np.asarray(measured.surfaces[number] + measured.corners[number], np.float64)
+        finite = np.isfinite(T_first_second).all() and np.isfinite(information).all()
+        if not finite or (pair.seen is None and measured.matched[number] < MATCHED):
             continue
         covariance = np.linalg.inv(information)
         added = (covariance + covariance.T)[np.ix_(order, order)] / 2
         yield RelativePose(
-            pair.first, pair.second, rigid(T), SIGMA_RAD, SIGMA_M, added=added, robust=cfg.pairs.robust
+            pair.first,
+            pair.second,
+            rigid(T_first_second),
+            SIGMA_RAD,
+            SIGMA_M,
+            added=added,
+            cauchy=cfg.pairs.robust,
         )
 
 
-def _as_tracked(poses: Float64[np.ndarray, "N 4 4"], joined: set[int], cfg: Config) -> Iterator[RelativePose]:
+def _as_tracked(
+    poses: Float64[np.ndarray, "N 4 4"], measured: set[int], cfg: Config
+) -> Iterator[RelativePose]:
     """Keyframes that no pair joins to an earlier one stay where they are beside the one before."""
-    for second in sorted(set(range(1, len(poses))) - joined):
+    for second in sorted(set(range(1, len(poses))) - measured):
         between = inverse(poses[second - 1]) @ poses[second]
         yield RelativePose(second - 1, second, between, cfg.loop.sigma_rotation, cfg.loop.sigma)
 
@@ -194,7 +218,7 @@ def _link_factors(state: SlamState, numbers: list[int], cfg: Config) -> Iterator
                 inverse(beside.T_sub_cam) @ keyframe.T_sub_cam,
                 cfg.loop.sigma_rotation,
                 cfg.loop.sigma,
-                robust=cfg.pairs.robust,
+                cauchy=cfg.pairs.robust,
             )
 
 

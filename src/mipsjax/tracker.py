@@ -45,7 +45,8 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     began = perf_counter()
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
-    found = follow_all(state, frame, candidates[0], cfg)
+    T_as_before = candidates[0]
+    found = follow_all(state, frame, T_as_before, cfg)
     if found:
         # What was measured between two images is a better guess than that the camera has gone on as before
         candidates = [found[0].T_sub_cam, candidates[0]]
@@ -65,9 +66,9 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     )
     T, info = jax.device_get((T, info))
     surfaces, corners = _information(info, cfg)
-    reference, information = _reference(state, near), surfaces + corners
+    reference, information = _reference(state, near, found), surfaces + corners
     together = directions(information)
-    T_sub_cam = _carried_on(rigid(T), candidates[0], together, cfg)
+    T_sub_cam = _carried_on(rigid(T), T_as_before, together, cfg)
     expected = _predicted(reference, state, frame, T_sub_cam, cfg)
     if together.deviation[-1] > cfg.track.held.weak:
         # What seems to hold a weak frame may be noise, the same in each frame, of which many would make a firm hold
@@ -98,16 +99,20 @@ def _predicted(reference: Matrix, state: SlamState, frame: Frame, T_sub_cam: Pos
     return predicted(reference, last.held, T_sub_cam, seconds, cfg.track.held)
 
 
-def _reference(state: SlamState, near: list[Keyframe]) -> Matrix:
-    """What the pose is off by that a frame is measured against.
+def _reference(state: SlamState, near: list[Keyframe], found: list[Seen]) -> Matrix:
+    """What the pose is off by that a frame is measured against: that of the best known keyframe nearby.
 
-    That is the best known keyframe nearby, as long as the camera itself is known to `SURE_M`. Otherwise it may be
-    elsewhere, and what it fits is what the map has learned of the frame before, a moment ago.
+    Where the camera may be farther off than `SURE_M`, a keyframe that seems near may be elsewhere, unless the frame
+    shows its corners; then what the frame fits is what the map has learned of the one before, a moment ago.
     """
-    metres, _ = deviations_of(state, state.records[-1])
-    if metres > SURE_M:
-        return state.records[-1].held.covariance
-    return min((keyframe.covariance for keyframe in near), key=np.trace)
+    last = state.records[-1]
+    metres, _ = deviations_of(state, last)
+    known = [keyframe.covariance for keyframe in near]
+    if metres > SURE_M and last.status in TRUSTED:
+        seen = {one.reference.record for one in found}
+        shown = [keyframe.covariance for keyframe in state.submap.keyframes if keyframe.number in seen]
+        known = [last.held.covariance, *shown]
+    return min(known, key=np.trace)
 
 
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
@@ -119,9 +124,9 @@ def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]
     return surfaces, corners
 
 
-def _carried_on(T_sub_cam: Pose, T_expected: Pose, together: Directions, cfg: Config) -> Pose:
-    """Along directions that nothing holds, where it was expected."""
-    motion = np.linalg.inv(T_expected) @ T_sub_cam
+def _carried_on(T_sub_cam: Pose, T_as_before: Pose, together: Directions, cfg: Config) -> Pose:
+    """Along directions that nothing holds, where the motion before it leads."""
+    motion = np.linalg.inv(T_as_before) @ T_sub_cam
     # To first order a twist: what is left open is a shift, or a small turn
     off = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
     open_ones = together.twist[together.deviation > cfg.track.held.weak]

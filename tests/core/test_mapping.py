@@ -163,7 +163,7 @@ def test_the_slope_of_the_surface_in_closed_form():
     near_edge = np.sort(np.abs(hit - corner.WALLS), 1)[:, 1] < 0.2
     wall = np.abs(hit - corner.WALLS).argmin(1)
     expected = np.abs((corner.rays(v, u) @ turn[:3, :3].T)[np.arange(len(u)), wall])
-    slope = np.asarray(mapping.surface_slope(depth, v, u, CAMERA))
+    slope = np.asarray(mapping.surface_slope(depth, v, u, CAMERA, CFG))
     plain = ~near_edge & (expected > 0.3)
     assert plain.sum() > 50
     # Differences of a float32 depth over 4 pixels, 7 cm apart at 2 m: 1e-6 / 0.07 of the slope

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from mipsjax.config import Config, PairConfig
 from mipsjax.core import relative
 from mipsjax.core.solvers import Landmarks
+from mipsjax.host.trust import ALLOWED, differing
 
 CFG = replace(Config(), pairs=PairConfig(pixels=2304))
 MOTION = pose((2.0, -3.0, 1.0), (0.06, -0.04, 0.05))
@@ -48,7 +49,8 @@ def measured(
     trust: float = 1.0,
 ) -> relative.Relative:
     """Of one pair, without the first axis."""
-    pairs = relative.Pairs(first, second, guess.astype(np.float32), landmarks)  # pyright: ignore[reportArgumentType]
+    T = guess.astype(np.float32)
+    pairs = relative.Pairs(first, second, T, T, landmarks)  # pyright: ignore[reportArgumentType]
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], pairs)
     found = relative.measure(stacked, np.float32(trust), CAMERA, CFG)
     return jax.tree.map(lambda part: np.asarray(part[0]), found)
@@ -93,17 +95,30 @@ def test_less_trust_moves_the_pose_from_corners_to_surfaces():
     for trust in (1e3, 1.0, 1e-3):
         found = measured(first, second, MOTION, corners(elsewhere, first), trust)
         off.append(apart(found.T_first_second, MOTION)[0])
+    # Most of the 4 mm between them, and what rounding to pixels leaves of the surfaces' pose
     assert off[0] > 0.003 and off[0] > off[1] > off[2] and off[2] < 0.001
 
 
-def test_both_pull_alike_where_they_differ():
-    """By so much that it says how far apart their own poses are: `host/trust.py` relies on it."""
+def difference(found: relative.Relative) -> np.ndarray:
+    """From where corners alone would have the frame to where surfaces would."""
+    return found.to_surfaces - found.to_corners
+
+
+def test_it_is_said_how_far_both_are_apart():
     first, second = see(HOME)[0], see(HOME @ MOTION)[0]
     elsewhere = MOTION @ pose((0.1, -0.05, 0.08), (0.003, 0.002, -0.002))
     found = measured(first, second, MOTION, corners(elsewhere, first))
-    surfaces, by_corners = (
-        np.linalg.inv(part.astype(np.float64)) for part in (found.surfaces, found.corners)
+    # Cauchy weights bend both a little: a tenth of what they are apart
+    np.testing.assert_allclose(difference(found), slope(elsewhere, MOTION), atol=6e-4)
+
+
+def test_noise_along_a_bare_wall_contradicts_no_corners():
+    """Its normals pull the frame along the wall, as firmly as they seem to hold it: little."""
+    rng = np.random.default_rng(1)
+    first, second = (
+        (wall() + 0.008 * rng.standard_normal(wall().shape)).astype(np.float32) for _ in range(2)
     )
-    difference = (surfaces + by_corners) @ found.pull
-    # Towards the surfaces' pose from that of the corners: Cauchy weights bend it a little
-    np.testing.assert_allclose(difference, slope(elsewhere, MOTION), atol=6e-4)
+    found = measured(first, second, np.eye(4), corners(np.eye(4), wall()))
+    stacked = relative.Relative(*(np.asarray(part)[None] for part in found))
+    said = differing(stacked, 0)
+    assert said is not None and said.contradiction(1.0) < ALLOWED

@@ -38,7 +38,7 @@ def on_walls() -> np.ndarray:
 
 def test_normals_are_those_of_the_walls(views):
     v, u = (x.ravel() for x in np.mgrid[4 : CAMERA.height - 4 : 5, 4 : CAMERA.width - 4 : 5])
-    planes = planes_at(jnp.asarray(views.depth[0]), v, u, CAMERA)
+    planes = planes_at(jnp.asarray(views.depth[0]), v, u, CAMERA, EXACT)
     inward = np.asarray(planes.normal) @ HOME[:3, :3].T
     wall = np.abs(np.asarray(planes.point) @ HOME[:3, :3].T + HOME[:3, 3] - WALLS).argmin(1)
     expected = INWARD[wall]
@@ -62,6 +62,20 @@ def test_distances_to_the_walls_are_exact(views, on_walls):
         np.testing.assert_allclose(np.median(found), offset, atol=1e-4)
         # A point may fall on the next wall near an edge
         assert np.mean(np.abs(found - offset) < 1e-3) > 0.95
+
+
+def test_a_noisy_wall_is_a_plane_where_the_noise_is_said_to_be_that_large():
+    """And an edge between two walls is none close by, where depth has no noise."""
+    v, u = (x.ravel() for x in np.mgrid[4 : CAMERA.height - 4 : 3, 4 : CAMERA.width - 4 : 3])
+    rng, growth, metres = np.random.default_rng(0), 0.002, 3.0
+    noise = growth * metres**2 * rng.standard_normal((CAMERA.height, CAMERA.width))
+    depth = jnp.asarray(metres + noise, jnp.float32)
+    even = [float(planes_at(depth, v, u, CAMERA, g).flat.mean()) for g in (EXACT, growth)]
+    # Middle and pixel differ by sqrt(1.5) of 18 mm: 5 mm hold both pairs for few, 41 mm for 19 in 20 each
+    assert even[0] < 0.1 and even[1] > 0.8
+    edge = jnp.asarray(0.5 + 0.02 * np.abs(np.arange(CAMERA.width) - 64.0), jnp.float32)
+    across = jnp.broadcast_to(edge, depth.shape)
+    assert not planes_at(across, np.array([48]), np.array([64]), CAMERA, growth).flat.any()
 
 
 def test_what_is_not_seen_is_masked(views, on_walls):

@@ -318,8 +318,8 @@ def test_a_robust_measurement_that_is_far_off_counts_for_little():
     edges.append(pose_edge(0, 2, wrong, rng))
     off = []
     for scale in (np.inf, 3.0):
-        found = solve(truth, [edge._replace(robust=scale) for edge in edges], robust=False)
-        assert found.weights.all()
+        found = solve(truth, [edge._replace(cauchy=scale) for edge in edges], robust=False)
+        assert found.ok
         off.append(error(found.T_world_sub, truth)[0])
     assert off[0] > 0.5 and off[1] < 0.01
 
@@ -329,7 +329,7 @@ def test_an_agreeing_measurement_counts_in_full_however_robust():
     truth = ring(3)
     edges = [pose_edge(j, k, relative(truth, j, k), rng) for j, k in ((0, 1), (1, 2), (0, 2))]
     whole, robust = (
-        solve(truth, [edge._replace(robust=scale) for edge in edges], robust=False)
+        solve(truth, [edge._replace(cauchy=scale) for edge in edges], robust=False)
         for scale in (np.inf, 100.0)
     )
     # The Cauchy weight of a residual of two deviations is 0.9996
@@ -463,7 +463,7 @@ HOLED = np.where(np.eye(20, 3) > 0, np.nan, GOOD_PLANES.p_first)
             GOOD_POSE._replace(added=c)
             for c in (-np.eye(6), np.full((6, 6), np.nan), np.eye(3), np.eye(6, k=1))
         ),
-        *(GOOD_POSE._replace(robust=k) for k in (0.0, -1.0, np.nan)),
+        *(GOOD_POSE._replace(cauchy=k) for k in (0.0, -1.0, np.nan)),
         *(GOOD_PLANES._replace(sigma=s) for s in (0.0, -0.1, np.nan)),
         *(GOOD_PLANES._replace(effective_points=s) for s in (0.0, -1.0, np.nan)),
         GOOD_PLANES._replace(p_first=HOLED),

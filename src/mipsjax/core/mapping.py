@@ -343,15 +343,19 @@ def draw_pixels(
         *grid_shape(cfg.map.pixels, height, width), jax.random.uniform(key, (2,)), height, width
     )
     ray = rays(v, u, camera)
-    slope = surface_slope(depth, v, u, camera) if cfg.sample.perpendicular else jnp.ones(u.shape)
+    slope = surface_slope(depth, v, u, camera, cfg) if cfg.sample.perpendicular else jnp.ones(u.shape)
     return Pixels(ray, depth[v, u], slope, color[v, u].astype(jnp.float32) / 255)
 
 
 def surface_slope(
-    depth: Float[Array, "H W"], v: Int[Array, " P"], u: Int[Array, " P"], camera: Intrinsics
+    depth: Float[Array, "H W"],
+    v: Int[Array, " P"],
+    u: Int[Array, " P"],
+    camera: Intrinsics,
+    cfg: Config,
 ) -> Float[Array, " P"]:
     """|n . ray| of the surface at each pixel; 1 where the depth image has no normal."""
-    planes = planes_at(depth, v, u, camera)
+    planes = planes_at(depth, v, u, camera, cfg.sensor.noise_growth)
     slope = jnp.abs(jnp.sum(planes.normal * rays(v, u, camera), -1))
     return jnp.where(planes.smooth, jnp.clip(slope, STEEPEST, 1.0), 1.0)
 

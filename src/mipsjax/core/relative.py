@@ -40,7 +40,9 @@ class Pairs(NamedTuple):
     """Depth, decimated by a whole factor; metres, 0 for no measurement."""
     second: Float[Array, "P h w"]
     T_first_second: Float[Array, "P 4 4"]
-    """About the pose of the second camera in the first."""
+    """Where the steps begin: pose of the second camera in the first."""
+    T_expected: Float[Array, "P 4 4"]
+    """That pose where nothing measures it."""
     landmarks: Landmarks | None
     """Corners of each first frame, in its camera, where the second one shows them."""
 
@@ -51,11 +53,13 @@ class Relative(NamedTuple):
 
     T_first_second: Float[Array, "P 4 4"]
     surfaces: Float[Array, "P 6 6"]
-    """Inverse covariance of the pose by depth images, and by the guess where these say nothing."""
+    """Inverse covariance of the pose by depth images, and by what was expected where these say nothing."""
     corners: Float[Array, "P 6 6"]
     """By corners of the image, at the trust that was given."""
-    pull: Float[Array, "P 6"]
-    """With what corners pull at that pose, and surfaces against it: the slope of their cost, 1/m and 1/rad."""
+    to_surfaces: Float[Array, "P 6"]
+    """The twist from that pose to where depth images alone would have it."""
+    to_corners: Float[Array, "P 6"]
+    """To where corners alone would have it; not finite where these leave something open."""
     matched: Float[Array, " P"]
     """Share of the second frame's points that lie on surfaces of the first."""
 
@@ -75,11 +79,11 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     """One of them, without the first axis."""
     points = _points(pair.second, camera, cfg)
     views = Views(pair.first[None], jnp.eye(4)[None])
-    together = cfg.track.held
     # Points weigh relative to each other, corners by what they are worth: here both do, and as few as are independent
-    of_points, of_corners = mean_precision(points, cfg) / together.points, trust / together.corners
+    of_points = mean_precision(points, cfg) / cfg.track.held.points
+    of_corners = trust / cfg.track.held.corners
     # As weak as in tracking: it counts only where nothing else holds the frame
-    prior = Prior(pair.T_first_second, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
+    prior = Prior(pair.T_expected, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
 
     def on_corners(T):
         if pair.landmarks is None:
@@ -87,25 +91,30 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
         system = landmark_system(T, pair.landmarks, camera, cfg)
         return jax.tree.map(lambda part: of_corners * part, system)
 
-    def together_at(T):
-        on_surfaces = view_rows(T, points, views, camera, cfg).system()
-        on_surfaces = jax.tree.map(lambda part: of_points * part, on_surfaces)
-        return jax.tree.map(lambda *parts: sum(parts), on_surfaces, on_corners(T), prior_system(T, prior))
+    def on_surfaces(T):
+        system = view_rows(T, points, views, camera, cfg).system()
+        expected = prior_system(T, prior)
+        return jax.tree.map(lambda part, weak: of_points * part + weak, system, expected)
+
+    def on_both(T):
+        return jax.tree.map(jnp.add, on_surfaces(T), on_corners(T))
 
     def moved(twist):
         errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera, cfg)
         return [(errors.distance, errors.mask)]
 
-    T = descend(together_at, pair.T_first_second, cfg.track.go.steps)
-    surfaces = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
-    corners = on_corners(T)
+    T = descend(on_both, pair.T_first_second, cfg.track.go.steps)
+    surfaces, corners = on_surfaces(T), on_corners(T)
+    # What the steps went by takes the noise of normals for a hold; what is stated does not
+    held = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
     hit = view_errors(T, points, views, camera, cfg).mask[0].astype(jnp.float32)
     close_by = 1 / cfg.sensor.noise_floor**2
     return Relative(
         T,
-        close_by * surfaces,
+        close_by * held,
         close_by * corners.hessian,
-        close_by * corners.slope,
+        -jnp.linalg.solve(surfaces.hessian, surfaces.slope),
+        -jnp.linalg.solve(corners.hessian, corners.slope),
         losses.masked_mean(hit, points.mask),
     )
 

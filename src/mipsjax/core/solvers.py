@@ -28,7 +28,9 @@ DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
 SETTLED = 3e-4  # metres, or rad: what a step is shorter than after which no more are tried
 PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
-PROBE = 0.08  # metres by which the frame is moved for that: past the pixels from which the normal at each is taken
+PROBE = (
+    0.08  # metres by which the frame is moved for that: past the pixels that each normal is of, within reach
+)
 SURE = 2.0  # standard errors of that measurement by which the frame may be held less
 PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
 FLOOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
@@ -153,29 +155,38 @@ def levenberg_marquardt(
     return descend(system, T, steps)
 
 
+class _Descent(NamedTuple):
+    """Levenberg-Marquardt on its way."""
+
+    T: Float[Array, "4 4"]
+    here: System
+    """At that pose."""
+    damping: Float[Array, ""]
+    settled: Bool[Array, ""]
+
+
 def descend(
     system: Callable[[Float[Array, "4 4"]], System], T: Float[Array, "4 4"], steps: int
 ) -> Float[Array, "4 4"]:
     """Levenberg-Marquardt on the normal equations that `system` gives of a pose, for a twist in the camera's frame:
-    at most so many steps, none after one that is shorter than `SETTLED`."""
+    at most so many steps, none after one that is shorter than `SETTLED`. Under `vmap` all are computed."""
 
-    def step(carry):
-        here, damping, _ = carry
-        T, now = here
-        damped = now.hessian + damping * jnp.diag(jnp.diag(now.hessian)) + FLOOR * jnp.eye(6)
-        twist = -jnp.linalg.solve(damped, now.slope)
-        T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
-        there = T_new, system(T_new)
-        better = there[1].cost < now.cost
-        here = jax.tree.map(partial(jnp.where, better), there, here)
-        return here, damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP), jnp.linalg.norm(twist) < SETTLED
+    def step(now: _Descent) -> _Descent:
+        hessian = now.here.hessian
+        damped = hessian + now.damping * jnp.diag(jnp.diag(hessian)) + FLOOR * jnp.eye(6)
+        twist = -jnp.linalg.solve(damped, now.here.slope)
+        T_new = now.T @ jaxlie.SE3.exp(twist).as_matrix()
+        there = system(T_new)
+        better = there.cost < now.here.cost
+        T, here = jax.tree.map(partial(jnp.where, better), (T_new, there), (now.T, now.here))
+        damping = now.damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)
+        return _Descent(T, here, damping, jnp.linalg.norm(twist) < SETTLED)
 
-    def unless_settled(carry, _):
-        return jax.lax.cond(carry[-1], lambda ended: ended, step, carry), None
+    def unless_settled(now: _Descent, _: None) -> tuple[_Descent, None]:
+        return jax.lax.cond(now.settled, lambda ended: ended, step, now), None
 
-    start = (T, system(T)), jnp.float32(DAMPING), jnp.bool_(False)
-    ((T, _), _, _), _ = jax.lax.scan(unless_settled, start, None, length=steps)
-    return T
+    start = _Descent(T, system(T), jnp.float32(DAMPING), jnp.bool_(False))
+    return jax.lax.scan(unless_settled, start, None, length=steps)[0].T
 
 
 def systems(

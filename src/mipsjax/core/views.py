@@ -106,9 +106,10 @@ def planes_at(
     v: Int[Array, " P"],
     u: Int[Array, " P"],
     camera: Intrinsics,
-    noise_growth: float = 0.0,
+    noise_growth: float,
 ) -> Planes:
-    """Points and normals at some pixels, from central differences of the depth image."""
+    """Points and normals at some pixels, from central differences of the depth image. `noise_growth` is that of its
+    depth (`SensorConfig`)."""
     height, width = depth.shape
 
     def point(dv, du):

@@ -175,6 +175,8 @@ def _as_drawn(
     there, back = _there_and_back(reference.grey, drawn, reference.pixel, reference.pixel, 0, EXACTLY)
     seen = _sampled(origin, *there.T[..., None])[:, 0]
     back &= _inside(seen, camera, WINDOW_PX // 2)  # the whole of its square
+    # Beyond the last depth that is kept nothing is known of where a pixel lies
+    back &= np.all(there <= _stride(camera) * (np.array(reference.depth.shape[::-1]) - 1), axis=1)
     return _motion(reference, np.flatnonzero(back), seen[back], fewest, camera)
 
 

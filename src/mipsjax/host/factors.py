@@ -33,7 +33,7 @@ class RelativePose(NamedTuple):
     """Never rejected: a sequential edge."""
     added: Float64[np.ndarray, "6 6"] = np.zeros((6, 6))
     """Covariance beside these, of a tangent (rotation, translation) on the right: what is known to be loose."""
-    robust: float = np.inf
+    cauchy: float = np.inf
     """Standard deviations, scale of a Cauchy weight: beyond it the measurement counts for less. Infinite: never."""
 
     @property
@@ -91,8 +91,8 @@ def check(factor: Factor, submaps: int) -> None:
         _check_sigma(factor, "sigma_translation", factor.sigma_translation)
         if not _is_covariance(factor.added):
             raise FactorError(factor, f"added must be a finite covariance 6 x 6, not {factor.added}")
-        if not factor.robust > 0:
-            raise FactorError(factor, f"robust must be positive, not {factor.robust}")
+        if not factor.cauchy > 0:
+            raise FactorError(factor, f"cauchy must be positive, not {factor.cauchy}")
         if not is_rigid(factor.T_first_second):
             raise FactorError(factor, f"T_first_second is not a rigid motion: {factor.T_first_second}")
     else:

@@ -62,7 +62,8 @@ class Solution(NamedTuple):
     weights: Float64[np.ndarray, "F"]
     """1 for a factor that was kept, 0 for one that was rejected as false."""
     error_before: float
-    """Half the sum of squared residuals over sigma of the kept factors, at the poses given."""
+    """Half the sum of squared residuals over sigma of the kept factors, at the poses given; where a factor has a Cauchy
+    weight, its cost by that."""
     error_after: float
     """The same at the poses returned."""
     ok: bool
@@ -205,10 +206,9 @@ def _made(factor: Factor) -> gtsam.NoiseModelFactor:
     if isinstance(factor, PointToPlane):
         return _plane_factor(factor)
     noise = gtsam.noiseModel.Gaussian.Covariance(factor.covariance)
-    if np.isfinite(factor.robust):
-        noise = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(factor.robust), noise
-        )
+    if np.isfinite(factor.cauchy):
+        weight = gtsam.noiseModel.mEstimator.Cauchy.Create(factor.cauchy)
+        noise = gtsam.noiseModel.Robust.Create(weight, noise)
     return gtsam.BetweenFactorPose3(factor.first, factor.second, _pose3(factor.T_first_second), noise)
 
 

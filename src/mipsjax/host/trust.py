@@ -14,12 +14,17 @@ from jaxtyping import Float64
 
 from mipsjax.core.relative import Relative
 
-USUAL = 0.03
-"""Median of what `contradiction` gives where colour and depth belong together: 0.007 to 0.02 in rendered recordings."""
+ALLOWED = 0.03
+"""Largest median of what `contradiction` gives at which corners have all trust. Rendered recordings, where colour and
+depth belong together, have less; the kitchen, whose colour is of another moment, ten times as much."""
+FEWEST = 10
+"""Pairs that say anything; fewer may contradict themselves by chance."""
 STEPS = np.geomspace(1, 1e-4, 81)
 """Of trust that are tried, from all of it downwards."""
 ROUNDING = 1e-5
 """Of the information of corners, relative to the largest: single precision knows no better."""
+MATCHED = 0.3
+"""Least share of a frame's points on surfaces of the other, so that these hold the pair without corners."""
 
 
 class Differing(NamedTuple):
@@ -38,25 +43,26 @@ class Differing(NamedTuple):
         return float(self.twist @ np.linalg.solve(covariance, self.twist)) / len(self.twist)
 
 
-def differing(measured: Relative, place: int, trust: float) -> Differing | None:
-    """Of one of the pairs that were measured with this trust; None where corners alone do not hold it."""
+def differing(measured: Relative, place: int) -> Differing | None:
+    """Of one of the pairs, measured with all trust; None where one of both alone does not hold it."""
     surfaces, corners = (
         np.asarray(part[place], np.float64) for part in (measured.surfaces, measured.corners)
     )
-    if not (np.isfinite(surfaces).all() and np.isfinite(corners).all()):
+    twist = np.asarray(measured.to_surfaces[place] - measured.to_corners[place], np.float64)
+    if not all(np.isfinite(part).all() for part in (surfaces, corners, twist)):
         return None
     strength = np.linalg.eigvalsh(corners)
-    if strength[0] <= ROUNDING * strength[-1]:
+    if strength[0] <= ROUNDING * strength[-1] or measured.matched[place] < MATCHED:
         return None
-    by_surfaces, by_corners = np.linalg.inv(surfaces), np.linalg.inv(corners)
-    # Each alone would be where its own slope vanishes; at the pose between them both pull alike
-    twist = (by_surfaces + by_corners) @ np.asarray(measured.pull[place], np.float64)
-    return Differing(twist, by_surfaces, trust * by_corners)
+    return Differing(twist, np.linalg.inv(surfaces), np.linalg.inv(corners))
 
 
 def trusted(pairs: list[Differing]) -> float:
-    """The most trust with which half of the pairs contradict themselves no more than is usual; all of it for none."""
-    for trust in STEPS if pairs else ():
-        if np.median([pair.contradiction(trust) for pair in pairs]) <= USUAL:
+    """The most trust with which half of the pairs contradict themselves no more than is allowed, the least that is
+    tried where none will do; all of it for too few pairs."""
+    if len(pairs) < FEWEST:
+        return 1.0
+    for trust in STEPS:
+        if np.median([pair.contradiction(trust) for pair in pairs]) <= ALLOWED:
             return float(trust)
-    return float(STEPS[-1]) if pairs else 1.0
+    return float(STEPS[-1])
