@@ -236,7 +236,7 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
     monkeypatch.setattr(final.tracking, "align", align)
     after = finish(before, CFG)
     first, second = given
-    for old, still, new in zip(before.submaps, second.submaps, after.submaps, strict=True):
+    for old, still, new in zip(first.submaps, second.submaps, after.submaps, strict=True):
         assert old.learned.field is still.learned.field is not new.learned.field
     np.testing.assert_array_equal(first.submaps[1].T_world_sub, before.submaps[1].T_world_sub)
     for state in (second, after):
