@@ -54,7 +54,8 @@ def run(
     cfg = replace(cfg, seed=seed)
     sequence = see(open_sequence(path, frames=frames, input=cfg.input))
     truth = sequence.T_world_cam
-    state = slam.start(sequence[0], sequence.intrinsics, cfg, None if truth is None else truth[0])
+    known = truth is not None and np.isfinite(truth[0]).all()
+    state = slam.start(sequence[0], sequence.intrinsics, cfg, truth[0] if known else None)
     began, early = time.perf_counter(), float("nan")
     for position in range(1, len(sequence)):
         if position == WARM_UP:

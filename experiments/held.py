@@ -152,7 +152,8 @@ def done(task: Task) -> dict[str, Any]:
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share
     row["contradicted"] = agreement is not None and agreement.begins is not None
-    if found.sequence.T_world_cam is not None:
+    true = found.sequence.T_world_cam
+    if true is not None and np.isfinite(true).all():
         row |= slides(found) | wrong(found) | stated(found.state, found) | near_changes(found)
         row |= loops(found.state, found, cfg) | surface(found.state, Path(path) / "observed.npz", cfg)
         plan(found, OUT / f"held-{row['sequence'].replace('/', '-')}-{task.switch}-{task.seed}.png")
