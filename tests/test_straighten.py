@@ -158,7 +158,7 @@ def test_a_loop_stays_closed_where_its_keyframes_are_too_far_apart_for_a_pair():
     )
     surfaces = replace(
         CFG,
-        pairs=replace(CFG.pairs, before=1, others=0, oldest=0),
+        pairs=replace(CFG.pairs, before=2, others=1, oldest=0),
         track=TrackConfig(corners=CornerConfig(count=0)),
     )
     moved, _ = straightened(state, surfaces)
@@ -174,6 +174,13 @@ def test_a_submap_that_nothing_joins_stays_and_so_does_a_run_that_wants_no_pairs
     assert moved.submaps[1] is lonely and moved.submaps[0] is not state.submaps[0]
     off = replace(CFG, pairs=PairConfig(before=0, others=0, oldest=0))
     assert straightened(state, off) == (state, 1.0)
+
+
+def test_keyframes_that_are_measured_once_stay_as_tracked():
+    state = travelled(drifted())
+    first = state.submaps[0]._replace(keyframes=state.submaps[0].keyframes[:2])
+    few = state._replace(submaps=(first,), records=state.records[:2], active=0)
+    assert straightened(few, CFG) == (few, 1.0)
 
 
 def test_a_keyframe_that_sees_nothing_of_the_others_stays_beside_the_one_before():

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 
 GROUP = 16
 """Pairs that are measured in one call."""
+AGREEING = 2
+"""Pairs for each keyframe, at least: measured once, it is known no better than as it was tracked."""
 SIGMA_M, SIGMA_RAD = 0.001, 0.0005
 """Of a measured pair, beside what it states: two images of one place err together."""
 
@@ -59,13 +61,13 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     """With keyframes where they lie by each other, the first one as it was; submaps move with their anchors, and frames
     with the keyframes that they hang on. Also the trust in corners that was found right.
 
-    Submaps that nothing joins to the first stay where they are.
+    Submaps that nothing joins to the first stay where they are, and so does all of a run of a few keyframes.
     """
     nodes = _keyframes(state)
     numbers = [node.keyframe.number for node in nodes]
     poses = np.stack([node.T_world_cam for node in nodes])
     pairs = [_followed(nodes, *places, state, cfg) for places in _near(poses, cfg)]
-    if not pairs:
+    if len(pairs) < AGREEING * len(nodes):
         return state, 1.0
     measured = _measured(nodes, pairs, 1.0, state, cfg)
     differences = [differing(measured, number) for number in range(len(pairs))]
