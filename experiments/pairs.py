@@ -1,12 +1,13 @@
 """Keyframes against each other after the last frame: how well pairs are measured, and what the graph makes of them.
 
-    python experiments/pairs.py [--seed 0]
+    python experiments/pairs.py [--seed 0] [--only NAME]
     python experiments/pairs.py --table
 
 Of each sequence the state after the last frame, loops closed once more. A pair's error is that of the pose of the later
 keyframe in the earlier one's camera, against the true poses; the median over all pairs. `ate_before_cm` and
-`ate_after_cm` are of the keyframes, before and after the graph. Parts of the method are switched off one by one. Writes
-`pairs.csv`; `--table` prints its rows for docs/trials.md.
+`ate_after_cm` are of the keyframes, before and after the graph. Parts of the method are switched off one by one. Where
+colour is `late`, each frame has that of the frame before it. Writes `pairs.csv`, of one sequence (`--only`) its rows
+anew; `--table` prints its rows for docs/trials.md.
 """
 
 from __future__ import annotations
@@ -27,27 +28,48 @@ from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import views
 from mipsjax.data.open import open_sequence
+from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.host.metrics import absolute_error
 from mipsjax.host.trust import differing, trusted
 from mipsjax.presets import preset
 from mipsjax.schedule import INLINE
 from mipsjax.state import SlamState, distance, inverse, rigid
 
-SEQUENCES = (
-    ("corridor_walk", 1),
-    ("small_house/living", 1),
-    ("synth:home-106+noise", 1),
-    ("redkitchen", 8),
-)
+LATE = ", colour late"
+SEQUENCES = {
+    "corridor_walk": 1,
+    "small_house/living": 1,
+    f"small_house/living{LATE}": 1,
+    "synth:home-106+noise": 1,
+    "redkitchen": 8,
+}
+"""With every how many frames."""
 FORMS = ("as it is", "2304 points", "planes up to 5 mm", "all trust")
+
+
+class Late:
+    """A sequence in which each frame has the colour of the one before it."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self._sequence = sequence
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __getitem__(self, place: int) -> Frame:
+        return self._sequence[place]._replace(color=self._sequence[max(place - 1, 0)].color)
 
 
 def travelled(name: str, stride: int, cfg: Config) -> tuple[SlamState, np.ndarray]:
     """The state before keyframes are moved, and the true poses of all frames."""
-    path = name if ":" in name else str(DATA / name)
+    path = name if ":" in name else str(DATA / name.removesuffix(LATE))
     sequence = open_sequence(path, frames=slice(None, None, stride), input=cfg.input)
     true = sequence.T_world_cam
     assert true is not None
+    sequence = Late(sequence) if name.endswith(LATE) else sequence
     state = slam.start(sequence[0], sequence.intrinsics, cfg, true[0])
     for place in range(1, len(sequence)):
         state = slam.step(state, sequence[place], cfg)
@@ -97,12 +119,17 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
     }
 
 
+def read() -> list[dict[str, str]]:
+    """The rows of the CSV."""
+    with (OUT / "pairs.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def print_table() -> None:
     """The rows of the CSV as a table of Markdown."""
-    with (OUT / "pairs.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    rows.insert(1, ["---"] * len(rows[0]))
-    print("\n".join("| " + " | ".join(cells) + " |" for cells in rows))
+    rows = read()
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    print("\n".join("| " + " | ".join(cells) + " |" for cells in lines))
 
 
 def main() -> None:
@@ -110,20 +137,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=SEQUENCES)
     parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
     if options.table:
         print_table()
         return
     enable_cache()
-    rows = []
-    for name, stride in SEQUENCES:
-        cfg = replace(preset("default"), seed=options.seed)
-        state, true = travelled(name, stride, cfg)
+    cfg = replace(preset("default"), seed=options.seed)
+    rows = {(known["sequence"], known["form"]): known for known in read()} if options.only else {}
+    for name in [options.only] if options.only else SEQUENCES:
+        state, true = travelled(name, SEQUENCES[name], cfg)
         for form in FORMS:
-            rows.append({"sequence": name, "every": stride} | row(state, true, form, cfg))
-            show(rows[-1])
-            write_rows("pairs", rows)
+            rows[name, form] = {"sequence": name, "every": SEQUENCES[name]} | row(state, true, form, cfg)
+            show(rows[name, form])
+            write_rows("pairs", rows.values())
 
 
 if __name__ == "__main__":
