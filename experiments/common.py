@@ -80,6 +80,22 @@ def run(
     return Run(state, sequence, row | figures(state, sequence) | speed)
 
 
+class Altered:
+    """A sequence of which each frame is what a function makes of the sequence and the frame's place."""
+
+    def __init__(self, sequence: Sequence, frame: Callable[[Sequence, int], Frame]) -> None:
+        self._sequence, self._frame = sequence, frame
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __getitem__(self, place: int) -> Frame:
+        return self._frame(self._sequence, place)
+
+
 def follow(
     frames: Iterable[Frame],
     camera: Intrinsics,

@@ -41,7 +41,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
-from common import DATA, OUT, ROOT, Run, changed, run, show, write_rows
+from common import DATA, OUT, ROOT, Altered, Run, changed, run, show, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.sequence import Frame, Sequence
@@ -117,21 +117,10 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
 GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour", "no-pairs")
 
 
-class Flat:
-    """A sequence whose images show nothing; depth and poses are as they were."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __len__(self) -> int:
-        return len(self._sequence)
-
-    def __getitem__(self, place: int) -> Frame:
-        frame = self._sequence[place]
-        return frame if frame.color is None else frame._replace(color=np.full_like(frame.color, FLAT))
+def flat(sequence: Sequence, place: int) -> Frame:
+    """With an image that shows nothing."""
+    frame = sequence[place]
+    return frame if frame.color is None else frame._replace(color=np.full_like(frame.color, FLAT))
 
 
 def configuration(switch: str) -> Config:
@@ -146,8 +135,11 @@ def done(task: Task) -> dict[str, Any]:
     enable_cache()
     path = task.name if ":" in task.name else str(DATA / task.name)
     cfg = configuration(task.switch)
-    see = Flat if task.switch == "flat" else lambda sequence: sequence
-    found = run(path, cfg, frames=slice(None, None, task.stride), seed=task.seed, see=see)
+    frames = slice(None, None, task.stride)
+    if task.switch == "flat":
+        found = run(path, cfg, frames=frames, seed=task.seed, see=lambda seen: Altered(seen, flat))
+    else:
+        found = run(path, cfg, frames=frames, seed=task.seed)
     row = task._asdict() | found.row | {"sequence": task.name.removeprefix("synth:")}
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from common import DATA, OUT, changed, show, write_rows
+from common import DATA, OUT, Altered, changed, show, write_rows
 from mipsjax import slam, straighten
 from mipsjax.background import taken_over
 from mipsjax.closure import closed_again
@@ -47,20 +47,9 @@ SEQUENCES = {
 FORMS = ("as it is", "2304 points", "planes up to 5 mm", "all trust")
 
 
-class Late:
-    """A sequence in which each frame has the colour of the one before it."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __len__(self) -> int:
-        return len(self._sequence)
-
-    def __getitem__(self, place: int) -> Frame:
-        return self._sequence[place]._replace(color=self._sequence[max(place - 1, 0)].color)
+def late(sequence: Sequence, place: int) -> Frame:
+    """With the colour of the frame before it."""
+    return sequence[place]._replace(color=sequence[max(place - 1, 0)].color)
 
 
 def travelled(name: str, stride: int, cfg: Config) -> tuple[SlamState, np.ndarray]:
@@ -69,7 +58,7 @@ def travelled(name: str, stride: int, cfg: Config) -> tuple[SlamState, np.ndarra
     sequence = open_sequence(path, frames=slice(None, None, stride), input=cfg.input)
     true = sequence.T_world_cam
     assert true is not None
-    sequence = Late(sequence) if name.endswith(LATE) else sequence
+    sequence = Altered(sequence, late) if name.endswith(LATE) else sequence
     state = slam.start(sequence[0], sequence.intrinsics, cfg, true[0])
     for place in range(1, len(sequence)):
         state = slam.step(state, sequence[place], cfg)

@@ -15,7 +15,7 @@ ROOT = Path(mipsjax.__file__).parent
 
 # From the left; a module imports only from layers before its own, and from its own package.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "config", "config_submaps", "files", "compilation"}),
+    frozenset({"errors", "config", "config_submaps", "config_tracking", "files", "compilation"}),
     frozenset({"presets"}),
     frozenset({"core"}),
     frozenset({"host", "data", "policy", "schedule"}),
@@ -33,6 +33,7 @@ LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
 # Imports between neighbours of one layer that are meant. No cycle may come of them (tested below).
 NEIGHBOURS = {
     ("config", "config_submaps"),  # the whole configuration holds the part for several submaps
+    ("config", "config_tracking"),  # and that for tracking
     ("files", "errors"),  # a file that cannot be written raises OutputError
     ("commandline", "options"),  # the command line is one source of options beside files and presets
     ("landmarks", "links"),  # a frame of a neighbour is where the frame that both share says

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mipsjax.config import Config, CornerConfig, TrackConfig
+from mipsjax.config import Config
+from mipsjax.config_tracking import CornerConfig, TrackConfig
 from mipsjax.core import mapping
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame

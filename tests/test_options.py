@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mipsjax.config import Config, GuardConfig, InputConfig
+from mipsjax.config import Config, InputConfig
+from mipsjax.config_tracking import GuardConfig
 from mipsjax.errors import ConfigError
 from mipsjax.options import RANGES, Range, flat, merged, read_toml, suggestion, to_dict, validate
 from mipsjax.presets import PRESETS, preset

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mipsjax.config import Config, GuardConfig, KeyframeConfig, MapConfig, SearchConfig, TrackConfig
+from mipsjax.config import Config, KeyframeConfig, MapConfig
+from mipsjax.config_tracking import GuardConfig, SearchConfig, TrackConfig
 from mipsjax.policy import NEW, STAY, Decision, FrameStats, Status, converged, decide, governor, widening
 
 CFG = Config(

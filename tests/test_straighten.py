@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mipsjax.bundle import make_keyframe
-from mipsjax.config import Config, CornerConfig, PairConfig, TrackConfig
+from mipsjax.config import Config, PairConfig
+from mipsjax.config_tracking import CornerConfig, TrackConfig
 from mipsjax.core.mapping import Learned
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame

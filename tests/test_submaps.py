@@ -14,8 +14,9 @@ import maps
 from compilations import compilations
 from mipsjax import closure, final, recovery, schedule, slam, territory
 from mipsjax.bundle import make_keyframe
-from mipsjax.config import Config, GuardConfig, InputConfig
+from mipsjax.config import Config, InputConfig
 from mipsjax.config_submaps import LoopConfig, VolumeConfig
+from mipsjax.config_tracking import GuardConfig
 from mipsjax.core import mapping, volume
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth

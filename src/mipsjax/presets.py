@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from mipsjax.config import (
     Config,
-    CornerConfig,
     FieldConfig,
-    GuardConfig,
-    HeldConfig,
     KeyframeConfig,
     LossConfig,
     MapConfig,
     MeshConfig,
     PairConfig,
-    RefineConfig,
     SampleConfig,
-    SearchConfig,
     SensorConfig,
-    TrackConfig,
 )
 from mipsjax.config_submaps import BackgroundConfig, LoopConfig, VolumeConfig
+from mipsjax.config_tracking import (
+    CornerConfig,
+    GuardConfig,
+    HeldConfig,
+    RefineConfig,
+    SearchConfig,
+    TrackConfig,
+)
 from mipsjax.errors import ConfigError
 
 UNLIMITED = 1e3

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from mipsjax.config import FieldConfig, SearchConfig
+from mipsjax.config import FieldConfig
+from mipsjax.config_tracking import SearchConfig
 from mipsjax.core import field as nf
 from mipsjax.core import particles
 from mipsjax.core.particles import Swarm

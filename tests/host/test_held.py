@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mipsjax.config import HeldConfig
+from mipsjax.config_tracking import HeldConfig
 from mipsjax.host.held import (
     EXACT,
     LASTING,

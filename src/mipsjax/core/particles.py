@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import FieldConfig, SearchConfig
+from mipsjax.config import FieldConfig
+from mipsjax.config_tracking import SearchConfig
 from mipsjax.core import field as nf
 from mipsjax.core import losses
 

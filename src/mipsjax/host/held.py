@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from mipsjax.config import HeldConfig
+from mipsjax.config_tracking import HeldConfig
 
 OPEN = 100.0
 """Metres or radians: the deviation of what nothing holds."""
