@@ -167,6 +167,22 @@ def write_rows(name: str, rows: Iterable[Mapping[str, Any]], folder: Path = OUT)
     return path
 
 
+def read_rows(name: str, folder: Path = OUT) -> list[dict[str, str]]:
+    """The rows of a CSV; none where there is no such file."""
+    path = folder / f"{name}.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def print_table(name: str) -> None:
+    """The rows of a CSV as a table of Markdown."""
+    rows = read_rows(name)
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    print("\n".join("| " + " | ".join(cells) + " |" for cells in lines))
+
+
 def show(row: Mapping[str, Any]) -> None:
     """One line a run, at once, so that a long experiment can be watched."""
     print(

@@ -10,8 +10,8 @@ hours: runs of which there is a row of the same code, the state of `src/` in git
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
 and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
-`kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `colour`, corners
-switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
+`kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `colour`, colour in
+tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
@@ -24,7 +24,6 @@ aligned.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -41,7 +40,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
-from common import DATA, OUT, ROOT, Altered, Run, changed, run, show, write_rows
+from common import DATA, OUT, ROOT, Altered, Run, changed, read_rows, run, show, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.sequence import Frame, Sequence
@@ -110,7 +109,7 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
         return [Task(group, *name, switch="no-pairs", seed=seed) for name, seed in product(names, seeds)]
     assert group == "colour"
     real = (("redkitchen", 4), ("rgbd_dataset_freiburg3_excerpt", 1))
-    switches = product(real, ("full", "no-corners"), seeds)
+    switches = product(real, ("full", "no-colour"), seeds)
     return [Task(group, name, stride, switch, seed) for (name, stride), switch, seed in switches]
 
 
@@ -125,8 +124,8 @@ def flat(sequence: Sequence, place: int) -> Frame:
 
 def configuration(switch: str) -> Config:
     cfg = preset("default")
-    if switch == "no-corners":
-        return changed(cfg, "track.corners", count=0)
+    if switch == "no-colour":
+        return changed(changed(cfg, "track.corners", count=0), "track.brightness", weight=0.0)
     return changed(cfg, "pairs", before=0, others=0, oldest=0) if switch == "no-pairs" else cfg
 
 
@@ -287,7 +286,7 @@ def in_a_process(task: Task, core: int) -> dict[str, Any]:
 
 def all_of(wanted: list[Task], workers: int, again: bool) -> None:
     """All runs, as many at a time as there are workers, each on a core of its own; replaces rows of the same runs."""
-    rows, now = {_key(row): row for row in _read()}, code()
+    rows, now = {_key(row): row for row in read_rows("held", RESULTS)}, code()
     same = {key for key, row in rows.items() if row.get("code") == now and not row.get("failed")}
     known = set() if now.endswith(UNKNOWN) else same
     wanted = [task for task in wanted if again or _key(task._asdict()) not in known]
@@ -322,14 +321,6 @@ def code() -> str:
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(str(row[field]) for field in Task._fields)
-
-
-def _read() -> list[dict[str, str]]:
-    path = RESULTS / "held.csv"
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 COLUMNS = {
@@ -369,7 +360,7 @@ run held to one core; `code` is the state of `src/` in git, `git rev-parse --sho
 
 
 def write_page() -> Path:
-    rows = _read()
+    rows = read_rows("held", RESULTS)
     parts = [PAGE]
     for group in dict.fromkeys(row["group"] for row in rows):
         chosen = [row for row in rows if row["group"] == group]

@@ -13,14 +13,13 @@ anew; `--table` prints its rows for docs/trials.md.
 from __future__ import annotations
 
 import argparse
-import csv
 from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
-from common import DATA, OUT, Altered, changed, show, write_rows
+from common import DATA, Altered, changed, print_table, read_rows, show, write_rows
 from mipsjax import slam, straighten
 from mipsjax.background import taken_over
 from mipsjax.closure import closed_again
@@ -30,7 +29,7 @@ from mipsjax.core import views
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.host.metrics import absolute_error
-from mipsjax.host.trust import differing, trusted
+from mipsjax.host.trust import ALLOWED, of_pair, trusted
 from mipsjax.presets import preset
 from mipsjax.schedule import INLINE
 from mipsjax.state import SlamState, distance, inverse, rigid
@@ -44,7 +43,7 @@ SEQUENCES = {
     "redkitchen": 8,
 }
 """With every how many frames."""
-FORMS = ("as it is", "2304 points", "planes up to 5 mm", "all trust")
+FORMS = ("as it is", "no brightness", "2304 points", "planes up to 5 mm", "all trust")
 
 
 def late(sequence: Sequence, place: int) -> Frame:
@@ -70,6 +69,8 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
     even = views.NOISE
     if form == "2304 points":
         cfg = changed(cfg, "pairs", pixels=2304)
+    if form == "no brightness":
+        cfg = changed(cfg, "track.brightness", weight=0.0)
     if form == "planes up to 5 mm":
         views.NOISE = 0.0
         jax.clear_caches()
@@ -78,8 +79,8 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
     true = true[[node.keyframe.number for node in nodes]]
     pairs = [straighten._followed(nodes, *places, state, cfg) for places in straighten._near(poses, cfg)]
     measured = straighten._measured(nodes, pairs, 1.0, state, cfg)
-    said = [found for i in range(len(pairs)) if (found := differing(measured, i)) is not None]
-    trust = 1.0 if form == "all trust" else trusted(said)
+    said = [found for i in range(len(pairs)) if (found := of_pair(measured, i)) is not None]
+    trust = 1.0 if form == "all trust" else trusted(said, ALLOWED)
     if trust < 1:
         measured = straighten._measured(nodes, pairs, trust, state, cfg)
     factors = list(straighten._pair_factors(pairs, measured, cfg))
@@ -108,19 +109,6 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
     }
 
 
-def read() -> list[dict[str, str]]:
-    """The rows of the CSV."""
-    with (OUT / "pairs.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def print_table() -> None:
-    """The rows of the CSV as a table of Markdown."""
-    rows = read()
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-    print("\n".join("| " + " | ".join(cells) + " |" for cells in lines))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -130,11 +118,11 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
     if options.table:
-        print_table()
+        print_table("pairs")
         return
     enable_cache()
     cfg = replace(preset("default"), seed=options.seed)
-    rows = {(known["sequence"], known["form"]): known for known in read()} if options.only else {}
+    rows = {(known["sequence"], known["form"]): known for known in read_rows("pairs")} if options.only else {}
     for name in [options.only] if options.only else SEQUENCES:
         state, true = travelled(name, SEQUENCES[name], cfg)
         for form in FORMS:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mipsjax.config import Config
-from mipsjax.config_tracking import CornerConfig, TrackConfig
+from mipsjax.config_tracking import BrightnessConfig, CornerConfig, TrackConfig
 from mipsjax.core import mapping
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame
@@ -91,7 +91,9 @@ def test_without_colour_or_corners_there_is_nothing_to_follow():
     state = travelled((0,), until=2)
     assert follow_all(state, frame(3, color=False), PATH[2], CFG) == []
     assert with_corners(state, frame(2, color=False), [], CFG) is state
-    none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
+    none = replace(
+        CFG, track=TrackConfig(corners=CornerConfig(count=0), brightness=BrightnessConfig(weight=0.0))
+    )
     assert travelled((0,), until=2, cfg=none).corners == ()
     assert landmarks([], 4, CAMERA, none) is None
 

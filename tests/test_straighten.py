@@ -10,7 +10,7 @@ import pytest
 
 from mipsjax.bundle import make_keyframe
 from mipsjax.config import Config, PairConfig
-from mipsjax.config_tracking import CornerConfig, TrackConfig
+from mipsjax.config_tracking import BrightnessConfig, CornerConfig, TrackConfig
 from mipsjax.core.mapping import Learned
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame
@@ -118,9 +118,11 @@ def test_true_poses_stay():
     assert metres < EXACT_M and radians < EXACT_RAD
 
 
-def test_without_corners_surfaces_say_what_they_can():
+def test_without_colour_surfaces_say_what_they_can():
     """A wall holds the distance to it and two turns; the rest stays as it was."""
-    none = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
+    none = replace(
+        CFG, track=TrackConfig(corners=CornerConfig(count=0), brightness=BrightnessConfig(weight=0.0))
+    )
     drift, (state, trust) = drifted(), straightened(travelled(drifted(), corners=False), none)
     assert trust == 1.0
     off = np.array([world_pose(state, r)[2, 3] - T[2, 3] for r, T in zip(state.records, PATH, strict=True)])
@@ -160,7 +162,7 @@ def test_a_loop_stays_closed_where_its_keyframes_are_too_far_apart_for_a_pair():
     surfaces = replace(
         CFG,
         pairs=replace(CFG.pairs, before=2, others=1, oldest=0),
-        track=TrackConfig(corners=CornerConfig(count=0)),
+        track=TrackConfig(corners=CornerConfig(count=0), brightness=BrightnessConfig(weight=0.0)),
     )
     moved, _ = straightened(state, surfaces)
     metres, _ = distance(PATH[COUNT - 1], world_pose(moved, moved.records[-1]))

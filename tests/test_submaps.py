@@ -245,8 +245,8 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
     poses = [np.stack([r.T_keyframe_cam for r in state.records]) for state in (before, second, after)]
     np.testing.assert_array_equal(poses[1], poses[0])
     assert (poses[2] != poses[0]).any()
-    # Corners hold a frame there as far as they were found right
-    held = np.stack([r.corners for r in before.records if r.submap == 0 and r.depth is not None])
+    # Colour holds a frame there as far as it was found right
+    held = np.stack([r.colour for r in before.records if r.submap == 0 and r.depth is not None])
     np.testing.assert_allclose(firm[0][: len(held)], 0.25 * held[: len(firm[0])], rtol=1e-6)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import maps
 from mipsjax.config import Config
+from mipsjax.core.solvers import Information
 from mipsjax.core.tracking import TrackInfo
 from mipsjax.data.sequence import Frame
 from mipsjax.host.corners import Corners
@@ -61,8 +62,10 @@ def test_a_camera_that_nobody_sees_may_be_anywhere_soon():
 
 
 def test_a_frame_that_is_not_finite_says_nothing():
-    held = [np.full((6, 6), np.nan, np.float32), np.eye(6, dtype=np.float32)]
-    info = TrackInfo(None, None, tuple(held), None, None)  # pyright: ignore[reportArgumentType]
-    surfaces, corners = _information(info, CFG)
+    held = [np.full((6, 6), np.nan, np.float32), *2 * [np.eye(6, dtype=np.float32)]]
+    information = Information(*held, np.zeros(6), np.zeros(6))  # pyright: ignore[reportArgumentType]
+    info = TrackInfo(None, None, information, None, None)  # pyright: ignore[reportArgumentType]
+    surfaces, colour = _information(info, CFG)
     np.testing.assert_array_equal(surfaces, NONE)
-    np.testing.assert_allclose(corners, np.eye(6) / CFG.track.held.corners)
+    by_both = 1 / CFG.track.held.corners + 1 / CFG.track.held.brightness
+    np.testing.assert_allclose(colour, by_both * np.eye(6))

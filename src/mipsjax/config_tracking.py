@@ -134,6 +134,23 @@ class CornerConfig:
 
 
 @dataclass(frozen=True)
+class BrightnessConfig:
+    """Differences in brightness between a frame and earlier ones, those of which corners are followed: another term of
+    these steps. A coarse level of their pyramids also leads from the expected pose to a better one."""
+
+    weight: float = 0.2
+    """Of a pixel, relative to a point of the map at the same standard deviation: neighbours err together. 0: none."""
+    pixels: int = 3072
+    """Parts of a frame, of each of which the pixel where brightness changes most is compared with one earlier frame."""
+    noise: float = 0.01
+    """Least standard deviation, of the brightness that there is; each image has the one that is measured."""
+    robust: float = 3.0
+    """Standard deviations, scale of the Cauchy weight."""
+    coarse_steps: int = 5
+    """At each of the coarser levels."""
+
+
+@dataclass(frozen=True)
 class HeldConfig:
     """What is said of how far a pose may be off."""
 
@@ -141,6 +158,8 @@ class HeldConfig:
     """Points of surfaces that err together, as neighbours on one surface do."""
     corners: float = 16.0
     """Corners of the image that do."""
+    brightness: float = 16.0
+    """Pixels whose brightness does."""
     acceleration: float = 3.0
     """m/s^2, standard deviation of a camera's, where nothing else says how it moves."""
     turn: float = 6.0
@@ -157,6 +176,7 @@ class TrackConfig:
     ro: SearchConfig = SearchConfig()
     go: RefineConfig = RefineConfig()
     corners: CornerConfig = CornerConfig()
+    brightness: BrightnessConfig = BrightnessConfig()
     held: HeldConfig = HeldConfig()
     prior: float = 0.1
     """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only

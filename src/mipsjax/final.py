@@ -64,8 +64,8 @@ def _adjusted(state: SlamState, place: int, cfg: Config) -> SlamState:
 
 
 def _aligned(state: SlamState, place: int, trust: float, cfg: Config) -> SlamState:
-    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays. Corners
-    hold it where it was as far as they are trusted."""
+    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays. Colour
+    holds it where it was as far as it is trusted."""
     small = state.camera.decimated(thumbnail_stride(state.camera))
     submap, records = state.submaps[place], list(state.records)
     places = [i for i, r in enumerate(records) if r.submap == place and r.depth is not None]
@@ -73,9 +73,9 @@ def _aligned(state: SlamState, place: int, trust: float, cfg: Config) -> SlamSta
         filled = [group[i % len(group)] for i in range(ALIGNED)]
         depth = np.stack([to_metres(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
-        corners = trust * np.stack([records[i].corners for i in filled]).astype(np.float32)
+        colour = trust * np.stack([records[i].colour for i in filled]).astype(np.float32)
         poses = np.asarray(
-            tracking.align(submap.learned.field, jnp.asarray(depth), start, corners, small, cfg)
+            tracking.align(submap.learned.field, jnp.asarray(depth), start, colour, small, cfg)
         )
         for i, pose in zip(group, poses, strict=False):
             records[i] = _moved(records[i], rigid(pose), submap.keyframes)

@@ -1,4 +1,4 @@
-"""Corners of earlier frames in the current one: where they say that the camera is, and what they add to tracking."""
+"""Earlier frames in the current one: where their corners say that the camera is, and what their images add."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 
 from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.photometric import Images
 from mipsjax.core.solvers import Landmarks
 from mipsjax.core.volume import moved
 from mipsjax.data.sequence import Frame
-from mipsjax.host.corners import Corners, Followed, corners, follow, grey_of
+from mipsjax.host.corners import Corners, Followed, corners, decimated, follow, grey_of
 from mipsjax.links import best_link
 from mipsjax.state import Pose, SlamState, inverse, pose_of
 
@@ -40,10 +41,7 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
     if frame.color is None or not state.corners:
         return []
     grey, found = grey_of(frame.color), list[Seen]()
-    for reference in state.corners:
-        T_sub_ref = _pose(state, reference, cfg)
-        if T_sub_ref is None:
-            continue
+    for reference, T_sub_ref in placed(state, cfg):
         guess = inverse(T_sub_ref) @ expected
         followed = follow(reference, grey, guess, cfg.track.corners.fewest, state.camera, near=bool(found))
         if followed is None:
@@ -51,6 +49,12 @@ def follow_all(state: SlamState, frame: Frame, expected: Pose, cfg: Config) -> l
         found.append(Seen(reference, T_sub_ref, followed))
         expected = found[-1].T_sub_cam
     return found
+
+
+def placed(state: SlamState, cfg: Config) -> list[tuple[Corners, Pose]]:
+    """Earlier frames of which corners are kept, with their poses in the active submap as far as these are known."""
+    poses = [_pose(state, reference, cfg) for reference in state.corners]
+    return [(reference, T) for reference, T in zip(state.corners, poses, strict=True) if T is not None]
 
 
 def _pose(state: SlamState, reference: Corners, cfg: Config) -> Pose | None:
@@ -88,10 +92,26 @@ def landmarks(found: list[Seen], frames: int, camera: Intrinsics, cfg: Config) -
     return Landmarks(*(jnp.asarray(part) for part in (p_sub, ray, axes, mask)))
 
 
+def images_of(
+    frames: list[tuple[Corners, Pose]], size: int, camera: Intrinsics, cfg: Config
+) -> Images | None:
+    """How frames looked at these poses, filled up to a fixed number; None where no brightness is wanted."""
+    if not cfg.track.brightness.weight:
+        return None
+    small = decimated(camera)
+    grey = np.zeros((size, camera.height, camera.width), np.uint8)
+    depth = np.zeros((size, small.height, small.width), np.float32)
+    T_sub_cam, mask = np.tile(np.eye(4, dtype=np.float32), (size, 1, 1)), np.arange(size) < len(frames)
+    for place, (reference, T) in enumerate(frames):
+        grey[place], depth[place], T_sub_cam[place] = reference.grey, reference.depth, T
+    return Images(*(jnp.asarray(part) for part in (grey, depth, T_sub_cam, mask)))
+
+
 def corners_of(frame: Frame, record: int, camera: Intrinsics, cfg: Config) -> Corners | None:
-    """Of one frame; None without colour or depth, or where the configuration wants none."""
+    """Of one frame, without any where only brightness is wanted; None without colour or depth, or where neither is."""
     count = cfg.track.corners.count
-    if not count or frame.color is None or frame.depth is None:
+    wanted = count or cfg.track.brightness.weight
+    if not wanted or frame.color is None or frame.depth is None:
         return None
     return corners(grey_of(frame.color), frame.depth, record, count, camera)
 

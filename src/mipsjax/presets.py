@@ -15,6 +15,7 @@ from mipsjax.config import (
 )
 from mipsjax.config_submaps import BackgroundConfig, LoopConfig, VolumeConfig
 from mipsjax.config_tracking import (
+    BrightnessConfig,
     CornerConfig,
     GuardConfig,
     HeldConfig,
@@ -59,6 +60,7 @@ PAPER = Config(
             method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0, known=0
         ),
         corners=CornerConfig(count=0),
+        brightness=BrightnessConfig(weight=0.0),
         held=HeldConfig(weak=UNLIMITED),
     ),
     guard=UNGUARDED,

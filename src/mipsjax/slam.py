@@ -18,6 +18,7 @@ from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
 from mipsjax.host.held import at
+from mipsjax.host.trust import RECENT
 from mipsjax.landmarks import corners_of, with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
 from mipsjax.recovery import find_again, lost_in_a_row, start_anew
@@ -93,6 +94,8 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
     learned = _learn(state, frame, tracked, decision, cfg)
     if decision.tells:
         learned = with_corners(_moved_on(learned, state, stats.residual), frame, tracked.found, cfg)
+        if tracked.doubt is not None:
+            learned = learned._replace(doubts=(*learned.doubts, tracked.doubt)[-RECENT:])
     state = learned
     if state.records[-1].info.keyframe:
         state = _order(state, cfg, executor)
@@ -169,7 +172,7 @@ def _learn(
     record = record._replace(
         held=tracked.held,
         depth=thumbnail(frame.depth, state.camera),
-        corners=tracked.info.information.corners,
+        colour=tracked.info.information.corners + tracked.info.information.brightness,
     )
     trouble = 0 if decision.status is Status.OK else state.trouble + 1
     return state._replace(records=(*state.records, record), trouble=trouble)

@@ -14,6 +14,7 @@ from mipsjax.core.volume import Box
 from mipsjax.host.corners import Corners
 from mipsjax.host.features import Features
 from mipsjax.host.held import EXACT, NONE, Held, Matrix, deviations
+from mipsjax.host.trust import Differing
 from mipsjax.policy import Status
 from mipsjax.schedule import Job
 
@@ -80,8 +81,8 @@ class Record(NamedTuple):
     """How far the pose in the submap may be off."""
     depth: UInt16[np.ndarray, "h w"] | None = None
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
-    corners: Matrix = NONE
-    """How firmly corners of the image held it then (`Information.corners`)."""
+    colour: Matrix = NONE
+    """How firmly corners and brightness of the image held it then (`core/solvers.py: Information`)."""
 
 
 class Refinement(NamedTuple):
@@ -113,7 +114,7 @@ class FrameInfo(NamedTuple):
     surfaces: str = ""
     """Standard deviations of the pose in the six directions that surfaces hold most to least firmly, metres or rad."""
     together: str = ""
-    """The same by surfaces and corners of the image."""
+    """The same by surfaces, corners of the image and brightness."""
     free: str = ""
     """The motion that these leave most open, (v, omega) in the camera's frame."""
     searched: bool = False
@@ -168,6 +169,8 @@ class SlamState(NamedTuple):
     """Under way."""
     corners: tuple[Corners, ...] = ()
     """Of the last trusted frame, then of keyframes before it: the newest, and the oldest that are still seen."""
+    doubts: tuple[Differing, ...] = ()
+    """How colour and surfaces of frames of late differ, by which colour is trusted."""
     residual: float = 0.0
     """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
 

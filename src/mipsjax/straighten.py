@@ -24,8 +24,8 @@ from mipsjax.core.solvers import Landmarks
 from mipsjax.host.corners import follow
 from mipsjax.host.factors import RelativePose
 from mipsjax.host.metrics import angles
-from mipsjax.host.trust import MATCHED, differing, trusted
-from mipsjax.landmarks import Seen, landmarks
+from mipsjax.host.trust import ALLOWED, MATCHED, of_pair, trusted
+from mipsjax.landmarks import Seen, images_of, landmarks
 from mipsjax.links import joined
 from mipsjax.state import Keyframe, Pose, SlamState, inverse, rigid
 
@@ -59,7 +59,7 @@ class Pair(NamedTuple):
 
 def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     """With keyframes where they lie by each other, the first one as it was; submaps move with their anchors, and frames
-    with the keyframes that they hang on. Also the trust in corners that was found right.
+    with the keyframes that they hang on. Also the trust in colour that was found right.
 
     Submaps that nothing joins to the first stay where they are, and so does all of a run of a few keyframes.
     """
@@ -70,8 +70,8 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     if len(pairs) < AGREEING * len(nodes):
         return state, 1.0
     measured = _measured(nodes, pairs, 1.0, state, cfg)
-    differences = [differing(measured, number) for number in range(len(pairs))]
-    trust = trusted([difference for difference in differences if difference is not None])
+    differences = [of_pair(measured, number) for number in range(len(pairs))]
+    trust = trusted([difference for difference in differences if difference is not None], ALLOWED)
     if trust < 1:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
@@ -80,7 +80,7 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     solved = _solved(poses, factors)
     if solved is None:
         return state, trust
-    log.info("%d keyframes in %d pairs; corners are trusted by %.2g", len(nodes), len(pairs), trust)
+    log.info("%d keyframes in %d pairs; colour is trusted by %.2g", len(nodes), len(pairs), trust)
     return _moved(state, dict(zip(numbers, solved, strict=True))), trust
 
 
@@ -160,6 +160,7 @@ def _measured(
             jnp.asarray(np.stack(starts), jnp.float32),
             jnp.asarray(np.stack([pair.T_first_second for pair in filled]), jnp.float32),
             jax.tree.map(lambda *parts: jnp.stack(parts), *(_landmarks(pair, state, cfg) for pair in filled)),
+            _images(nodes, filled, state, cfg),
         )
         said = jax.device_get(relative.measure(given, np.float32(trust), state.camera, cfg))
         found.append(jax.tree.map(lambda part: part[: len(group)], said))  # noqa: B023 (called here)
@@ -170,12 +171,27 @@ def _landmarks(pair: Pair, state: SlamState, cfg: Config) -> Landmarks | None:
     return landmarks([] if pair.seen is None else [pair.seen], 1, state.camera, cfg)
 
 
+def _images(nodes: list[Node], pairs: list[Pair], state: SlamState, cfg: Config) -> relative.Shown | None:
+    """Of these pairs; they say nothing where one of both has no colour."""
+    if not cfg.track.brightness.weight:
+        return None
+    blank, parts = np.zeros((state.camera.height, state.camera.width), np.uint8), []
+    for pair in pairs:
+        first, second = (nodes[place].keyframe.corners for place in (pair.first, pair.second))
+        shown = [] if first is None or second is None else [(first, np.eye(4))]
+        parts.append((blank if second is None else second.grey, images_of(shown, 1, state.camera, cfg)))
+    seconds, firsts = zip(*parts, strict=True)
+    return relative.Shown(
+        jax.tree.map(lambda *of_pairs: jnp.stack(of_pairs), *firsts), jnp.asarray(np.stack(seconds))
+    )
+
+
 def _pair_factors(pairs: list[Pair], measured: relative.Relative, cfg: Config) -> Iterator[RelativePose]:
     """Of pairs that corners or enough surfaces join."""
     order = [3, 4, 5, 0, 1, 2]  # of a tangent: that of the graph is (rotation, translation)
     for number, pair in enumerate(pairs):
         T_first_second = np.asarray(measured.T_first_second[number])
-        information = np.asarray(measured.surfaces[number] + measured.corners[number], np.float64)
+        information = np.asarray(measured.surfaces[number] + measured.colour[number], np.float64)
         finite = np.isfinite(T_first_second).all() and np.isfinite(information).all()
         if not finite or (pair.seen is None and measured.matched[number] < MATCHED):
             continue

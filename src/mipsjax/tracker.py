@@ -14,7 +14,8 @@ from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.data.sequence import Frame
 from mipsjax.host.held import NONE, Directions, Held, Matrix, at, directions, held, of_turns, predicted
-from mipsjax.landmarks import Seen, follow_all, landmarks
+from mipsjax.host.trust import ALLOWED_TRACKED, Differing, differing, trusted
+from mipsjax.landmarks import Seen, follow_all, images_of, landmarks, placed
 from mipsjax.policy import Status, converged, widening
 from mipsjax.state import Keyframe, Pose, Record, SlamState, deviations_of, distance, last_pose, rigid
 
@@ -34,7 +35,9 @@ class Tracked(NamedTuple):
     surfaces: Directions
     """How firmly surfaces hold it."""
     together: Directions
-    """The same with corners of the image."""
+    """The same with corners of the image and brightness."""
+    doubt: Differing | None
+    """How these differ from surfaces."""
     held: Held
     ms: float
 
@@ -45,6 +48,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     began = perf_counter()
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
+    earlier, trust = 1 + cfg.track.corners.keyframes, trusted(state.doubts, ALLOWED_TRACKED)
     T_as_before = candidates[0]
     found = follow_all(state, frame, T_as_before, cfg)
     if found:
@@ -61,12 +65,14 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         cfg,
         views_of([near[round(i)] for i in np.linspace(0, len(near) - 1, cfg.track.go.views)]),
         np.float32(converged(state.residual, cfg)),
-        landmarks(found, 1 + cfg.track.corners.keyframes, state.camera, cfg),
+        landmarks(found, earlier, state.camera, cfg),
         views_of(nearest(state.submap.keyframes, candidates[0], known)) if known else None,
+        None if frame.color is None else images_of(placed(state, cfg), earlier, state.camera, cfg),
+        np.float32(trust),
     )
     T, info = jax.device_get((T, info))
-    surfaces, corners = _information(info, cfg)
-    reference, information = _reference(state, near, found), surfaces + corners
+    surfaces, colour = _information(info, cfg)
+    reference, information = _reference(state, near, found), surfaces + trust * colour
     together = directions(information)
     T_sub_cam = _carried_on(rigid(T), T_as_before, together, cfg)
     expected = _predicted(reference, state, frame, T_sub_cam, cfg)
@@ -79,6 +85,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         found,
         directions(surfaces),
         together,
+        differing(info.information.to_surfaces - info.information.to_colour, surfaces, colour),
         held(reference, expected, T_sub_cam, information),
         1e3 * (perf_counter() - began),
     )
@@ -116,12 +123,12 @@ def _reference(state: SlamState, near: list[Keyframe], found: list[Seen]) -> Mat
 
 
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
-    """Of surfaces and of corners, as if those that err together were one; none of a frame that is not finite."""
+    """Of surfaces and of colour, as if those that err together were one; none of a frame that is not finite."""
     wanted = cfg.track.held
-    given = zip(info.information, (wanted.points, wanted.corners), strict=True)
+    given = zip(info.information[:3], (wanted.points, wanted.corners, wanted.brightness), strict=True)
     parts = [np.asarray(part, np.float64) / together for part, together in given]
-    surfaces, corners = (part if np.isfinite(part).all() else NONE for part in parts)
-    return surfaces, corners
+    surfaces, corners, brightness = (part if np.isfinite(part).all() else NONE for part in parts)
+    return surfaces, corners + brightness
 
 
 def _carried_on(T_sub_cam: Pose, T_as_before: Pose, together: Directions, cfg: Config) -> Pose:

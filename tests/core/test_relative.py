@@ -1,4 +1,4 @@
-"""Two frames against each other: the pose they agree on, what holds it, and what corners and surfaces say apart."""
+"""Two frames against each other: the pose they agree on, what holds it, and what colour and surfaces say apart."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ import pytest
 from corner import CAMERA, HOME, apart, pose, see
 from jaxtyping import Array, Float
 
+import painted
 from mipsjax.config import Config, PairConfig
 from mipsjax.core import relative
+from mipsjax.core.camera import Intrinsics
+from mipsjax.core.photometric import Images
 from mipsjax.core.solvers import Landmarks
-from mipsjax.host.trust import ALLOWED, differing
+from mipsjax.host.trust import ALLOWED, of_pair
 
 CFG = replace(Config(), pairs=PairConfig(pixels=2304))
 MOTION = pose((2.0, -3.0, 1.0), (0.06, -0.04, 0.05))
 GUESS = MOTION @ pose((0.5, 0.4, -0.3), (0.01, -0.015, 0.01))
 WALL_M = 2.0
-ALL = np.float32(1)
 
 
 def wall() -> np.ndarray:
@@ -47,12 +49,14 @@ def measured(
     guess: np.ndarray,
     landmarks: Landmarks | None,
     trust: float = 1.0,
+    shown: relative.Shown | None = None,
+    camera: Intrinsics = CAMERA,
 ) -> relative.Relative:
     """Of one pair, without the first axis."""
     T = guess.astype(np.float32)
-    pairs = relative.Pairs(first, second, T, T, landmarks)  # pyright: ignore[reportArgumentType]
+    pairs = relative.Pairs(first, second, T, T, landmarks, shown)  # pyright: ignore[reportArgumentType]
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], pairs)
-    found = relative.measure(stacked, np.float32(trust), CAMERA, CFG)
+    found = relative.measure(stacked, np.float32(trust), camera, CFG)
     return jax.tree.map(lambda part: np.asarray(part[0]), found)
 
 
@@ -76,10 +80,27 @@ def test_a_plain_wall_leaves_open_what_corners_hold():
     alone = measured(wall(), wall(), np.eye(4), None)
     np.testing.assert_allclose(np.diag(alone.surfaces)[free], weak, rtol=0.5)
     assert (np.diag(alone.surfaces)[[2, 3, 4]] > 100 * weak).all()
-    np.testing.assert_array_equal(alone.corners, 0)
+    np.testing.assert_array_equal(alone.colour, 0)
     both = measured(wall(), wall(), pose((0, 0, 1), (0.02, 0, 0)), corners(np.eye(4), wall()))
-    assert (np.diag(both.corners)[free] > 100 * weak).all()
+    assert (np.diag(both.colour)[free] > 100 * weak).all()
     assert apart(both.T_first_second, np.eye(4))[0] < 2e-4  # what the guess pulls
+
+
+def test_brightness_holds_what_a_plain_wall_leaves_open():
+    """Without any corners, from a guess a few pixels off; a first frame that had no colour says nothing."""
+    painting = painted.painting()
+    T_second = pose((1.0, 2.0, -1.0), (0.04, -0.03, 0.05))
+    (grey, first), (later, second) = (painted.wall(T, painting) for T in (np.eye(4), T_second))
+    guess = T_second @ pose((0.3, -0.2, 0.3), (0.01, -0.008, 0.01))
+    camera, every = painted.CAMERA, 2
+    first, second = first[::every, ::every], second[::every, ::every]
+    for colored in (True, False):
+        parts = (grey[None], first[None], np.eye(4, dtype=np.float32)[None], np.array([colored]))
+        shown = relative.Shown(Images(*(jnp.asarray(part) for part in parts)), later)  # pyright: ignore[reportArgumentType]
+        found = measured(first, second, guess, None, shown=shown, camera=camera)
+        metres, degrees = apart(found.T_first_second, T_second)
+        assert (metres < 0.001 and degrees < 0.02) == colored
+        assert (np.linalg.eigvalsh(found.colour)[0] > 10 / CFG.track.prior**2) == colored
 
 
 def test_a_frame_without_depth_stays_at_the_guess():
@@ -100,8 +121,8 @@ def test_less_trust_moves_the_pose_from_corners_to_surfaces():
 
 
 def difference(found: relative.Relative) -> np.ndarray:
-    """From where corners alone would have the frame to where surfaces would."""
-    return found.to_surfaces - found.to_corners
+    """From where colour alone would have the frame to where surfaces would."""
+    return found.to_surfaces - found.to_colour
 
 
 def test_it_is_said_how_far_both_are_apart():
@@ -120,5 +141,5 @@ def test_noise_along_a_bare_wall_contradicts_no_corners():
     )
     found = measured(first, second, np.eye(4), corners(np.eye(4), wall()))
     stacked = relative.Relative(*(np.asarray(part)[None] for part in found))
-    said = differing(stacked, 0)
+    said = of_pair(stacked, 0)
     assert said is not None and said.contradiction(1.0) < ALLOWED

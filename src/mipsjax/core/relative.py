@@ -1,5 +1,5 @@
-"""The pose of one frame in another, by what the two measured: their depth images and corners of the image. No map is
-asked, so that none can hand its errors on.
+"""The pose of one frame in another, by what the two measured: their depth images, and their images, corners of these
+and brightness. No map is asked, so that none can hand its errors on.
 
 Twists are (v, omega), metres and radians, in the second frame's camera: T(xi) = T exp(xi).
 """
@@ -12,25 +12,24 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from mipsjax.config import Config
 from mipsjax.core import losses
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
-from mipsjax.core.solvers import (
-    Landmarks,
-    Points,
-    Prior,
-    System,
-    descend,
-    landmark_system,
-    mean_precision,
-    prior_system,
-    steady_hessian,
-    view_errors,
-    view_rows,
-)
+from mipsjax.core.equations import Points, Prior, System, descend, mean_precision, prior_system
+from mipsjax.core.photometric import Images, brightness_system, pyramid, with_noise
+from mipsjax.core.solvers import Landmarks, landmark_system, steady_hessian, view_errors, view_rows
 from mipsjax.core.views import Views
+
+
+class Shown(NamedTuple):
+    """P pairs of images."""
+
+    first: Images
+    """Of each pair one, with a second axis of length 1."""
+    second: UInt8[Array, "P H W"]
+    """Grey."""
 
 
 class Pairs(NamedTuple):
@@ -45,6 +44,8 @@ class Pairs(NamedTuple):
     """That pose where nothing measures it."""
     landmarks: Landmarks | None
     """Corners of each first frame, in its camera, where the second one shows them."""
+    shown: Shown | None
+    """How they looked; None where brightness is not wanted."""
 
 
 class Relative(NamedTuple):
@@ -54,23 +55,22 @@ class Relative(NamedTuple):
     T_first_second: Float[Array, "P 4 4"]
     surfaces: Float[Array, "P 6 6"]
     """Inverse covariance of the pose by depth images, and by what was expected where these say nothing."""
-    corners: Float[Array, "P 6 6"]
-    """By corners of the image, at the trust that was given."""
+    colour: Float[Array, "P 6 6"]
+    """By corners and brightness of the images, at the trust that was given."""
     to_surfaces: Float[Array, "P 6"]
     """The twist from that pose to where depth images alone would have it."""
-    to_corners: Float[Array, "P 6"]
-    """To where corners alone would have it; not finite where these leave something open."""
+    to_colour: Float[Array, "P 6"]
+    """To where images alone would have it; not finite where these leave something open."""
     matched: Float[Array, " P"]
     """Share of the second frame's points that lie on surfaces of the first."""
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))
 def measure(pairs: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Config) -> Relative:
-    """Robust second-order steps on point-to-plane distances and on errors of corners in the image, one pair after the
-    other.
+    """Robust second-order steps on point-to-plane distances, errors of corners in the image and differences of
+    brightness, one pair after the other.
 
-    `trust` is what corners count for, relative to `track.held.corners`. `camera` is that of the images in which corners
-    were found.
+    `trust` is what images count for, relative to `track.held`. `camera` is theirs.
     """
     return jax.lax.map(lambda pair: _measured(Pairs(*pair), trust, camera, cfg), tuple(pairs))
 
@@ -79,32 +79,41 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     """One of them, without the first axis."""
     points = _points(pair.second, camera, cfg)
     views = Views(pair.first[None], jnp.eye(4)[None])
-    # Points weigh relative to each other, corners by what they are worth: here both do, and as few as are independent
+    # Points weigh relative to each other, images by what they are worth: here both do, and as few as are independent
     of_points = mean_precision(points, cfg) / cfg.track.held.points
-    of_corners = trust / cfg.track.held.corners
     # As weak as in tracking: it counts only where nothing else holds the frame
     prior = Prior(pair.T_expected, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
-
-    def on_corners(T):
-        if pair.landmarks is None:
-            return System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
-        system = landmark_system(T, pair.landmarks, camera, cfg)
-        return jax.tree.map(lambda part: of_corners * part, system)
 
     def on_surfaces(T):
         system = view_rows(T, points, views, camera, cfg).system()
         expected = prior_system(T, prior)
         return jax.tree.map(lambda part, weak: of_points * part + weak, system, expected)
 
-    def on_both(T):
-        return jax.tree.map(jnp.add, on_surfaces(T), on_corners(T))
+    def on_images(T, seen):
+        found = System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
+        if pair.landmarks is not None:
+            corners = landmark_system(T, pair.landmarks, camera, cfg)
+            found = jax.tree.map(lambda all, part: all + part / cfg.track.held.corners, found, corners)
+        if seen is not None:
+            shade = brightness_system(T, seen, camera, cfg)
+            found = jax.tree.map(lambda all, part: all + part / cfg.track.held.brightness, found, shade)
+        return jax.tree.map(lambda part: trust * part, found)
+
+    def on_both(T, seen):
+        return jax.tree.map(jnp.add, on_surfaces(T), on_images(T, seen))
 
     def moved(twist):
         errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera, cfg)
         return [(errors.distance, errors.mask)]
 
-    T = descend(on_both, pair.T_first_second, cfg.track.go.steps)
-    surfaces, corners = on_surfaces(T), on_corners(T)
+    T, seen = pair.T_first_second, None
+    if pair.shown is not None:
+        first, grey = pair.shown.first, pair.shown.second.astype(jnp.float32)
+        seen, coarse = pyramid(first, grey, pair.second, 2, camera, cfg)
+        T = descend(partial(on_both, seen=coarse), T, cfg.track.brightness.coarse_steps)
+        seen = with_noise(seen, T, camera, cfg)
+    T = descend(partial(on_both, seen=seen), T, cfg.track.go.steps)
+    surfaces, colour = on_surfaces(T), on_images(T, seen)
     # What the steps went by takes the noise of normals for a hold; what is stated does not
     held = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
     hit = view_errors(T, points, views, camera, cfg).mask[0].astype(jnp.float32)
@@ -112,9 +121,9 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     return Relative(
         T,
         close_by * held,
-        close_by * corners.hessian,
+        close_by * colour.hessian,
         -jnp.linalg.solve(surfaces.hessian, surfaces.slope),
-        -jnp.linalg.solve(corners.hessian, corners.slope),
+        -jnp.linalg.solve(colour.hessian, colour.slope),
         losses.masked_mean(hit, points.mask),
     )
 

@@ -20,29 +20,28 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics, transform
+from mipsjax.core.equations import (
+    Points,
+    Prior,
+    Rows,
+    System,
+    descend,
+    mean_precision,
+    precisions,
+    prior_system,
+    robust_cost,
+)
+from mipsjax.core.photometric import Shades, brightness_system
 from mipsjax.core.views import PlaneErrors, Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
-DAMPING = 1e-3  # first Levenberg-Marquardt factor
-DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
-SETTLED = 3e-4  # metres, or rad: what a step is shorter than after which no more are tried
 PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
 PROBE = (
     0.08  # metres by which the frame is moved for that: past the pixels that each normal is of, within reach
 )
 SURE = 2.0  # standard errors of that measurement by which the frame may be held less
 PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
-FLOOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
-
-
-class Points(NamedTuple):
-    """P measured points of one frame."""
-
-    p_cam: Float[Array, "P 3"]
-    color: Float[Array, "P 3"]
-    mask: Bool[Array, " P"]
-    """False where there is no measurement."""
 
 
 class Landmarks(NamedTuple):
@@ -58,48 +57,6 @@ class Landmarks(NamedTuple):
     """False fills up to a fixed number."""
 
 
-def robust_cost(psi: Float[Array, " P"], scale: float) -> Float[Array, " P"]:
-    """Cauchy cost, square metres; its weight is 1 / (1 + (psi / scale)^2)."""
-    return scale**2 * jnp.log1p((psi / scale) ** 2)
-
-
-def precisions(points: Points, cfg: Config) -> Float[Array, " P"]:
-    """Inverse variances of the points' depths, 1 in the mean of the measured ones and 0 elsewhere."""
-    inverse = losses.precision(points.p_cam[:, 2], cfg.sensor) * points.mask
-    mean = losses.masked_mean(inverse, points.mask)
-    return inverse / jnp.where(mean > 0, mean, 1)
-
-
-def mean_precision(points: Points, cfg: Config) -> Float[Array, ""]:
-    """Of the measured points' depths, 1 close by: what `precisions` are relative to."""
-    return losses.masked_mean(losses.precision(points.p_cam[:, 2], cfg.sensor), points.mask)
-
-
-class System(NamedTuple):
-    """Cost, and the normal equations of one second-order step."""
-
-    cost: Float[Array, ""]
-    hessian: Float[Array, "6 6"]
-    slope: Float[Array, "6"]
-
-
-class Rows(NamedTuple):
-    """P residuals that are to vanish; what follows from them is summed over P."""
-
-    residual: Float[Array, "*K P"]
-    """Metres."""
-    jacobian: Float[Array, "*K P 6"]
-    """By a twist (v, omega) in the camera's frame."""
-    weight: Float[Array, "*K P"]
-    cost: Float[Array, "*K P"]
-
-    def system(self) -> System:
-        """Of all rows together."""
-        rows = self.jacobian.reshape(-1, 6)
-        weighted = rows.T * self.weight.reshape(-1)[None]
-        return System(jnp.sum(self.cost), weighted @ rows, weighted @ self.residual.reshape(-1))
-
-
 class Information(NamedTuple):
     """How firmly a frame is held: inverse covariances of its pose, for a twist (v, omega) in the camera's frame,
     1/m^2 and 1/rad^2, as if each point and corner erred alone."""
@@ -108,14 +65,12 @@ class Information(NamedTuple):
     """By the map and the depth images of keyframes."""
     corners: Float[Array, "6 6"]
     """By corners of the image."""
-
-
-class Prior(NamedTuple):
-    """A pose that a frame has if nothing else says where it is."""
-
-    T_sub_cam: Float[Array, "4 4"]
-    weight: Float[Array, "6 6"]
-    """Inverse covariance, relative to that of a point's distance: of a twist (v, omega) in the camera's frame."""
+    brightness: Float[Array, "6 6"]
+    """By the brightness of all of it."""
+    to_surfaces: Float[Array, "6"]
+    """The twist from the pose to where surfaces alone would have it."""
+    to_colour: Float[Array, "6"]
+    """To where corners and brightness alone would; not finite where these leave something open."""
 
 
 class Evidence(NamedTuple):
@@ -125,6 +80,10 @@ class Evidence(NamedTuple):
     views: Views | None = None
     """Depth images of keyframes, decimated by a whole factor."""
     landmarks: Landmarks | None = None
+    shades: Shades | None = None
+    """Images of earlier frames, at one level of the pyramid."""
+    trust: Float[Array, ""] | float = 1.0
+    """What landmarks and shades count for, of what they would."""
     prior: Prior | None = None
 
 
@@ -143,63 +102,48 @@ def levenberg_marquardt(
     Uncertain points weigh less, as in RO: what was learned a moment ago is noisier than the rest.
     Points where the field is saturated keep their cost but have no weight, so that a step that loses sight of
     the map is never an improvement. Depth images of keyframes are a second term where there are any, corners of the
-    image a third, and a prior pose a fourth.
+    image a third, its brightness a fourth, and a prior pose a fifth.
     """
 
     def system(T):
-        terms = systems(field, T, seen, part, camera, cfg)
-        if seen.prior is not None:
-            terms = *terms, prior_system(T, seen.prior)
-        return jax.tree.map(lambda *parts: sum(parts), *terms)
+        on_map = map_rows(field, T, seen.points, part, cfg).system()
+        return jax.tree.map(lambda *parts: sum(parts), on_map, *_without_map(T, seen, camera, cfg))
 
     return descend(system, T, steps)
 
 
-class _Descent(NamedTuple):
-    """Levenberg-Marquardt on its way."""
-
-    T: Float[Array, "4 4"]
-    here: System
-    """At that pose."""
-    damping: Float[Array, ""]
-    settled: Bool[Array, ""]
-
-
-def descend(
-    system: Callable[[Float[Array, "4 4"]], System], T: Float[Array, "4 4"], steps: int
+def approach(
+    T: Float[Array, "4 4"], seen: Evidence, steps: int, camera: Intrinsics, cfg: Config
 ) -> Float[Array, "4 4"]:
-    """Levenberg-Marquardt on the normal equations that `system` gives of a pose, for a twist in the camera's frame:
-    at most so many steps, none after one that is shorter than `SETTLED`. Under `vmap` all are computed."""
+    """The same steps by all that needs no map: cheap, at a coarse level of the pyramid from farther off."""
 
-    def step(now: _Descent) -> _Descent:
-        hessian = now.here.hessian
-        damped = hessian + now.damping * jnp.diag(jnp.diag(hessian)) + FLOOR * jnp.eye(6)
-        twist = -jnp.linalg.solve(damped, now.here.slope)
-        T_new = now.T @ jaxlie.SE3.exp(twist).as_matrix()
-        there = system(T_new)
-        better = there.cost < now.here.cost
-        T, here = jax.tree.map(partial(jnp.where, better), (T_new, there), (now.T, now.here))
-        damping = now.damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)
-        return _Descent(T, here, damping, jnp.linalg.norm(twist) < SETTLED)
+    def system(T):
+        return jax.tree.map(lambda *parts: sum(parts), *_without_map(T, seen, camera, cfg))
 
-    def unless_settled(now: _Descent, _: None) -> tuple[_Descent, None]:
-        return jax.lax.cond(now.settled, lambda ended: ended, step, now), None
-
-    start = _Descent(T, system(T), jnp.float32(DAMPING), jnp.bool_(False))
-    return jax.lax.scan(unless_settled, start, None, length=steps)[0].T
+    return descend(system, T, steps)
 
 
-def systems(
-    field: nf.Field, T: Float[Array, "4 4"], seen: Evidence, part: nf.Part, camera: Intrinsics, cfg: Config
-) -> tuple[System, System]:
-    """Normal equations of surfaces (the field and depth images of keyframes), and of corners of the image."""
-    surfaces = map_rows(field, T, seen.points, part, cfg).system()
+def _without_map(T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config) -> list[System]:
+    """Normal equations of all that there is beside the map."""
+    colour = jax.tree.map(lambda *parts: seen.trust * sum(parts), *_of_colour(T, seen, camera, cfg))
+    found = [colour]
     if seen.views is not None:
-        views = view_rows(T, seen.points, seen.views, camera, cfg).system()
-        surfaces = jax.tree.map(jnp.add, surfaces, views)
-    if seen.landmarks is None:
-        return surfaces, jax.tree.map(jnp.zeros_like, surfaces)
-    return surfaces, landmark_system(T, seen.landmarks, camera, cfg)
+        found.append(view_rows(T, seen.points, seen.views, camera, cfg).system())
+    if seen.prior is not None:
+        found.append(prior_system(T, seen.prior))
+    return found
+
+
+def _of_colour(
+    T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config
+) -> tuple[System, System]:
+    """Normal equations of corners and of brightness, zero where there are none."""
+    corners = brightness = System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
+    if seen.landmarks is not None:
+        corners = landmark_system(T, seen.landmarks, camera, cfg)
+    if seen.shades is not None:
+        brightness = brightness_system(T, seen.shades, camera, cfg)
+    return corners, brightness
 
 
 def information(
@@ -229,10 +173,20 @@ def information(
     surfaces = mean_precision(points, cfg) * steady_hessian(parts, moved)
     close_by = 1 / cfg.sensor.noise_floor**2
     # Points weigh relative to each other, corners relative to points: here each by what it is worth
-    if seen.landmarks is None:
-        return Information(close_by * surfaces, jnp.zeros((6, 6)))
-    corners = landmark_system(T, seen.landmarks, camera, cfg).hessian
-    return Information(close_by * surfaces, close_by * corners)
+    corners, brightness = _of_colour(T, seen, camera, cfg)
+    return Information(
+        close_by * surfaces,
+        close_by * corners.hessian,
+        close_by * brightness.hessian,
+        _step(*(part.system() for part in parts)),
+        _step(corners, brightness),
+    )
+
+
+def _step(*systems: System) -> Float[Array, "6"]:
+    """The twist to where these alone would have the frame."""
+    together = jax.tree.map(lambda *parts: sum(parts), *systems)
+    return -jnp.linalg.solve(together.hessian, together.slope)
 
 
 Distances = list[tuple[Float[Array, "*K P"], Bool[Array, "*K P"]]]
@@ -323,14 +277,6 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
     weight = corners.weight * (landmarks.mask & in_front) / (1 + squared / scale**2)
     cost = corners.weight * landmarks.mask * scale**2 * jnp.log1p(squared / scale**2)
     return Rows(error, rows, jnp.repeat(weight[:, None], 2, 1), cost).system()
-
-
-def prior_system(T: Float[Array, "4 4"], prior: Prior) -> System:
-    """Normal equations of how far a pose is from the prior one, for a twist in the camera's frame."""
-    off = jaxlie.SE3.from_matrix(jnp.linalg.inv(prior.T_sub_cam) @ T).log()
-    # The derivative of the logarithm is the identity up to half of `off`, which is small where this counts
-    slope = prior.weight @ off
-    return System(off @ slope, prior.weight, slope)
 
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:

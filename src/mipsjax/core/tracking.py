@@ -17,17 +17,17 @@ from mipsjax.config import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, particles
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, transform
+from mipsjax.core.equations import Points, Prior, robust_cost
+from mipsjax.core.photometric import LEVELS, Images, grey_of, pyramid, with_noise
 from mipsjax.core.solvers import (
     Evidence,
     Information,
     Landmarks,
-    Points,
-    Prior,
     adam,
+    approach,
     information,
     levenberg_marquardt,
     map_rows,
-    robust_cost,
 )
 from mipsjax.core.views import Views, observed
 
@@ -99,12 +99,16 @@ def track(
     converged: Float[Array, ""] | None = None,
     landmarks: Landmarks | None = None,
     known: Views | None = None,
+    images: Images | None = None,
+    trust: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, "4 4"], TrackInfo]:
     """Pose of one frame in the submap, from a few candidates of the motion prior.
 
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to. `landmarks` are corners of earlier frames, which these steps keep where the frame
-    shows them. `known` are more keyframes: the second-order steps trust the field only where these observed something.
+    shows them, and `images` are the same frames as they looked: by these and `views` it comes near before the map is
+    asked. `trust` is what both count for, of what they would. `known` are more keyframes: the second-order steps trust
+    the field only where these observed something.
 
     The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
     field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
@@ -123,14 +127,25 @@ def track(
     # So weak that it counts only where nothing else holds the frame
     prior = Prior(start, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
 
+    finest, coarser = None, []
+    if images is not None:
+        finest, *coarser = pyramid(images, grey_of(color), depth, LEVELS, camera, cfg)
+
+    def closer(T):
+        """By images and depth images of earlier frames alone, from coarse to fine."""
+        for level in reversed(coarser):
+            seen = Evidence(coarse, views, landmarks, level, trust, prior)
+            T = approach(T, seen, cfg.track.brightness.coarse_steps, camera, cfg)
+        return T
+
     def evidence(T):
         """Of the frame about at T."""
-        trusted = points
+        trusted, shade = points, finest and with_noise(finest, T, camera, cfg)
         if known is not None:
             small = camera.decimated(round(camera.width / known.depth.shape[2]))
             learned = observed(known, transform(T, points.p_cam), small, BEHIND)
             trusted = points._replace(mask=points.mask & learned)
-        return Evidence(trusted, views, landmarks, prior)
+        return Evidence(trusted, views, landmarks, shade, trust, prior)
 
     limit = ro.residual if converged is None else converged
     smooth = go.method == "lm" and cfg.field.encoding == "both"
@@ -139,6 +154,7 @@ def track(
         if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
+            T = closer(T)
             T = levenberg_marquardt(field, T, evidence(T), "whole", go.steps, camera, cfg)
         return T, measure_fit(field, T, points, "whole", cfg)
 
@@ -182,13 +198,13 @@ def align(
     field: nf.Field,
     depth: Float[Array, "F H W"],
     T: Float[Array, "F 4 4"],
-    corners: Float[Array, "F 6 6"],
+    colour: Float[Array, "F 6 6"],
     camera: Intrinsics,
     cfg: Config,
 ) -> Float[Array, "F 4 4"]:
     """Poses of F frames after a few second-order steps on every pixel of their (small) depth images.
 
-    `corners` is how firmly corners of the image held each of them where it is (`Information.corners`): what surfaces
+    `colour` is how firmly images held each of them where it is (corners and brightness of `Information`): what surfaces
     leave free stays as it was. So does a frame that does not come out finite.
     """
     v, u = jnp.mgrid[: camera.height, : camera.width].reshape(2, -1)
@@ -201,7 +217,7 @@ def align(
         there = levenberg_marquardt(field, T, seen, "whole", cfg.track.go.final_steps, camera, cfg)
         return jnp.where(jnp.all(jnp.isfinite(there)), there, T)
 
-    return jax.vmap(one)(depth, T, corners)
+    return jax.vmap(one)(depth, T, colour)
 
 
 class Registration(NamedTuple):

@@ -86,7 +86,7 @@ def corners(
     camera: Intrinsics,
 ) -> Corners:
     """The strongest corners of a frame, where the depth around them is measured and belongs to one surface."""
-    found = cv2.goodFeaturesToTrack(grey, count, QUALITY, SPACING_PX)
+    found = cv2.goodFeaturesToTrack(grey, count, QUALITY, SPACING_PX) if count else None
     pixel = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
     surface, z = surface_depth(depth, pixel)
     pixel, z = pixel[surface], z[surface]
@@ -95,6 +95,11 @@ def corners(
     p_cam = np.stack([x * z, y * z, z], 1).astype(np.float32)
     every = _stride(camera)
     return Corners(record, grey, _filled(depth[::every, ::every]), pixel, p_cam, axes)
+
+
+def decimated(camera: Intrinsics) -> Intrinsics:
+    """That of `Corners.depth`."""
+    return camera.decimated(_stride(camera))
 
 
 def _stride(camera: Intrinsics) -> int:
