@@ -12,7 +12,7 @@ from mipsjax.config_tracking import BrightnessConfig, CornerConfig, TrackConfig
 from mipsjax.core import mapping
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame
-from mipsjax.landmarks import follow_all, landmarks, with_corners
+from mipsjax.landmarks import follow_all, images_of, landmarks, placed, with_corners
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, Keyframe, Pose, Record, SlamState, Submap, distance
 from painted import CAMERA, painting, pose, wall
@@ -126,3 +126,27 @@ def test_where_the_camera_is_does_not_depend_on_a_turned_submap():
         follow_all(s, frame(3), start @ PATH[2], CFG) for s, start in ((state, np.eye(4)), (turned, T))
     )
     np.testing.assert_allclose(other.T_sub_cam, T @ one.T_sub_cam, atol=1e-3)
+
+
+def test_tracking_is_given_images_of_earlier_frames_as_many_as_always():
+    """Of fewer frames again, so that each point has an image; of none they say nothing."""
+    state = travelled((0,), until=2)
+    frames = placed(state, CFG)
+    assert [reference.record for reference, _ in frames] == [2, 0]
+    given, none = images_of(frames, 4, CAMERA, CFG), images_of([], 4, CAMERA, CFG)
+    assert given is not None and none is not None
+    assert given.mask.all() and not none.mask.any()
+    assert [part.shape for part in given] == [part.shape for part in none]
+    for place, record in enumerate((2, 0, 2, 0)):
+        np.testing.assert_array_equal(given.grey[place], wall(PATH[record], PAINTED)[0])
+        np.testing.assert_allclose(given.T_sub_cam[place], PATH[record], atol=1e-6)
+    without = replace(CFG, track=TrackConfig(brightness=BrightnessConfig(weight=0.0)))
+    assert images_of(frames, 4, CAMERA, without) is None
+
+
+def test_brightness_alone_needs_no_corners():
+    cfg = replace(CFG, track=TrackConfig(corners=CornerConfig(count=0)))
+    state = travelled((0,), until=2, cfg=cfg)
+    assert [len(kept.pixel) for kept in state.corners] == [0, 0]
+    assert follow_all(state, frame(3), PATH[2], cfg) == []
+    assert len(placed(state, cfg)) == 2

@@ -1,4 +1,4 @@
-"""The part of the configuration that concerns tracking: RO, GO, corners, what holds a frame, and when it is trusted."""
+"""The part of the configuration that concerns tracking: RO, GO, colour, what holds a frame, and when it is trusted."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class CornerConfig:
 @dataclass(frozen=True)
 class BrightnessConfig:
     """Differences in brightness between a frame and earlier ones, those of which corners are followed: another term of
-    these steps. A coarse level of their pyramids also leads from the expected pose to a better one."""
+    these steps. Coarser levels of their pyramids also lead from the expected pose to a better one."""
 
     weight: float = 0.2
     """Of a pixel, relative to a point of the map at the same standard deviation: neighbours err together. 0: none."""

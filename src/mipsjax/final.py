@@ -12,6 +12,7 @@ from mipsjax.bundle import FINISH, MAP, adjust, random_key
 from mipsjax.closure import closed_again
 from mipsjax.config import Config
 from mipsjax.core import tracking
+from mipsjax.host.trust import ALLOWED_TRACKED, trusted
 from mipsjax.links import unjoined
 from mipsjax.rest import rested
 from mipsjax.schedule import INLINE, Executor
@@ -29,8 +30,9 @@ def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamSt
     `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor`
     is the one that `step` was given. Warns where submaps hang on nothing."""
     state = closed_again(taken_over(state, executor), cfg)
+    as_tracked = trusted(state.doubts, ALLOWED_TRACKED)
     # Where submaps do not learn once more they stay bent, and so do the keyframes in them
-    state, trust = straightened(state, cfg) if cfg.map.final_steps else (state, 1.0)
+    state, trust = straightened(state, cfg) if cfg.map.final_steps else (state, as_tracked)
     for place in range(len(state.submaps)):
         state = _adjusted(state, place, cfg)
     if cfg.track.go.final_steps and cfg.track.go.method == "lm":

@@ -95,15 +95,16 @@ def landmarks(found: list[Seen], frames: int, camera: Intrinsics, cfg: Config) -
 def images_of(
     frames: list[tuple[Corners, Pose]], size: int, camera: Intrinsics, cfg: Config
 ) -> Images | None:
-    """How frames looked at these poses, filled up to a fixed number; None where no brightness is wanted."""
+    """How frames looked at these poses, again from the first up to a fixed number; None where they are not wanted."""
     if not cfg.track.brightness.weight:
         return None
     small = decimated(camera)
     grey = np.zeros((size, camera.height, camera.width), np.uint8)
     depth = np.zeros((size, small.height, small.width), np.float32)
-    T_sub_cam, mask = np.tile(np.eye(4, dtype=np.float32), (size, 1, 1)), np.arange(size) < len(frames)
-    for place, (reference, T) in enumerate(frames):
-        grey[place], depth[place], T_sub_cam[place] = reference.grey, reference.depth, T
+    T_sub_cam, mask = np.tile(np.eye(4, dtype=np.float32), (size, 1, 1)), np.full(size, bool(frames))
+    for place in range(size if frames else 0):
+        reference, T_sub_cam[place] = frames[place % len(frames)]
+        grey[place], depth[place] = reference.grey, reference.depth
     return Images(*(jnp.asarray(part) for part in (grey, depth, T_sub_cam, mask)))
 
 

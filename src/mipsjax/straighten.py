@@ -24,7 +24,7 @@ from mipsjax.core.solvers import Landmarks
 from mipsjax.host.corners import follow
 from mipsjax.host.factors import RelativePose
 from mipsjax.host.metrics import angles
-from mipsjax.host.trust import ALLOWED, MATCHED, of_pair, trusted
+from mipsjax.host.trust import ALLOWED, ALLOWED_TRACKED, MATCHED, of_pair, trusted
 from mipsjax.landmarks import Seen, images_of, landmarks
 from mipsjax.links import joined
 from mipsjax.state import Keyframe, Pose, SlamState, inverse, rigid
@@ -68,7 +68,7 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     poses = np.stack([node.T_world_cam for node in nodes])
     pairs = [_followed(nodes, *places, state, cfg) for places in _near(poses, cfg)]
     if len(pairs) < AGREEING * len(nodes):
-        return state, 1.0
+        return state, trusted(state.doubts, ALLOWED_TRACKED)
     measured = _measured(nodes, pairs, 1.0, state, cfg)
     differences = [of_pair(measured, number) for number in range(len(pairs))]
     trust = trusted([difference for difference in differences if difference is not None], ALLOWED)

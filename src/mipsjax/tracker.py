@@ -37,7 +37,7 @@ class Tracked(NamedTuple):
     together: Directions
     """The same with corners of the image and brightness."""
     doubt: Differing | None
-    """How these differ from surfaces."""
+    """How colour differs from surfaces; None where one of both does not hold the frame."""
     held: Held
     ms: float
 
@@ -67,7 +67,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         np.float32(converged(state.residual, cfg)),
         landmarks(found, earlier, state.camera, cfg),
         views_of(nearest(state.submap.keyframes, candidates[0], known)) if known else None,
-        None if frame.color is None else images_of(placed(state, cfg), earlier, state.camera, cfg),
+        images_of([] if frame.color is None else placed(state, cfg), earlier, state.camera, cfg),
         np.float32(trust),
     )
     T, info = jax.device_get((T, info))
@@ -125,10 +125,12 @@ def _reference(state: SlamState, near: list[Keyframe], found: list[Seen]) -> Mat
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
     """Of surfaces and of colour, as if those that err together were one; none of a frame that is not finite."""
     wanted = cfg.track.held
-    given = zip(info.information[:3], (wanted.points, wanted.corners, wanted.brightness), strict=True)
-    parts = [np.asarray(part, np.float64) / together for part, together in given]
-    surfaces, corners, brightness = (part if np.isfinite(part).all() else NONE for part in parts)
-    return surfaces, corners + brightness
+    found = info.information
+    surfaces = np.asarray(found.surfaces, np.float64) / wanted.points
+    colour = np.asarray(found.corners, np.float64) / wanted.corners
+    colour = colour + np.asarray(found.brightness, np.float64) / wanted.brightness
+    surfaces, colour = (part if np.isfinite(part).all() else NONE for part in (surfaces, colour))
+    return surfaces, colour
 
 
 def _carried_on(T_sub_cam: Pose, T_as_before: Pose, together: Directions, cfg: Config) -> Pose:

@@ -14,8 +14,8 @@ from corner import ADAM, CAMERA, CFG, HOME, WALLS, apart, pose, see, unprojected
 from planes import CFG as PLANE_CFG
 from planes import plane
 
+from mipsjax.core import equations, losses, solvers, tracking
 from mipsjax.core import field as nf
-from mipsjax.core import losses, solvers, tracking
 from mipsjax.core.camera import transform
 from mipsjax.core.views import Views
 
@@ -278,31 +278,36 @@ def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
     evidence = solvers.Evidence(seen, views, landmarks_of(np.eye(4), p_sub))
     T = jnp.eye(4)
     found = jax.jit(lambda: solvers.information(wall, T, evidence, CAMERA, PLANE_CFG))()
-    surfaces, corners = (np.asarray(part) * PLANE_CFG.sensor.noise_floor**2 for part in found)
+    surfaces, corners = (
+        np.asarray(part) * PLANE_CFG.sensor.noise_floor**2 for part in (found.surfaces, found.corners)
+    )
     # The points are 2 m away, where a depth is worth less than close by
     surfaces = surfaces / float(losses.precision(jnp.float32(2.0), PLANE_CFG.sensor))
-    system = jax.jit(lambda: solvers.systems(wall, T, evidence, "whole", CAMERA, PLANE_CFG))()[0]
+    normals = jax.jit(
+        lambda: (
+            solvers.map_rows(wall, T, seen, "whole", PLANE_CFG).system().hessian
+            + solvers.view_rows(T, seen, views, CAMERA, PLANE_CFG).system().hessian
+        )
+    )()
     # Two shifts along the wall and a turn about its normal are free
-    assert np.linalg.eigvalsh(surfaces)[2] < 0.1 * np.linalg.eigvalsh(system.hessian)[2]
-    np.testing.assert_allclose(
-        np.linalg.eigvalsh(surfaces)[3:], np.linalg.eigvalsh(system.hessian)[3:], rtol=0.1
-    )
-    assert np.linalg.eigvalsh(surfaces + corners)[0] > 10 * np.linalg.eigvalsh(system.hessian)[0]
+    assert np.linalg.eigvalsh(surfaces)[2] < 0.1 * np.linalg.eigvalsh(normals)[2]
+    np.testing.assert_allclose(np.linalg.eigvalsh(surfaces)[3:], np.linalg.eigvalsh(normals)[3:], rtol=0.1)
+    assert np.linalg.eigvalsh(surfaces + corners)[0] > 10 * np.linalg.eigvalsh(normals)[0]
 
 
 def test_steps_end_where_they_are_short():
     """Each takes a fifth of the way to a pose: it ends a few steps of that length before it, and not at it."""
 
     def system(T):
-        there = solvers.prior_system(T, solvers.Prior(TRUTH, jnp.eye(6)))
+        there = equations.prior_system(T, equations.Prior(TRUTH, jnp.eye(6)))
         return there._replace(hessian=5 * there.hessian)
 
     start = jnp.asarray(TRUTH @ NEAR, jnp.float32)
-    some, many = (jax.jit(lambda T, n=n: solvers.descend(system, T, n))(start) for n in (60, 200))
+    some, many = (jax.jit(lambda T, n=n: equations.descend(system, T, n))(start) for n in (60, 200))
     np.testing.assert_array_equal(some, many)
     metres, degrees = apart(many, TRUTH)
     # What is left is four times the last step
-    assert solvers.SETTLED < np.hypot(metres, np.radians(degrees)) < 5 * solvers.SETTLED
+    assert equations.SETTLED < np.hypot(metres, np.radians(degrees)) < 5 * equations.SETTLED
 
 
 def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, points):
@@ -310,7 +315,7 @@ def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, po
 
     def end(points):
         weak = (CFG.sensor.noise_floor / CFG.track.prior) ** 2 * jnp.eye(6)
-        evidence = solvers.Evidence(points, prior=solvers.Prior(away, weak))
+        evidence = solvers.Evidence(points, prior=equations.Prior(away, weak))
         start = jnp.asarray(TRUTH, jnp.float32)
         return solvers.levenberg_marquardt(corner_map.field, start, evidence, "whole", 10, CAMERA, CFG)
 

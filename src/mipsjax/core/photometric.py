@@ -26,6 +26,11 @@ STEEP = 0.012
 HIDDEN_M, HIDDEN = 0.05, 0.02
 """Metres, and share of the depth, by which a point may lie off the surface that an image shows in its place; farther
 off it is hidden there, or hides that surface."""
+REACH_PX = 2
+"""Pixels, about, from which a smoothed gradient is taken along each direction."""
+LOST = 3.0
+"""Scales of the robust cost by which an error costs most: as much as a point that an image does not show. So no step
+gains by losing sight of it."""
 FEWEST = 50
 """Steep points that an image shows, below which it says nothing."""
 DEVIATION = 1.48
@@ -72,11 +77,12 @@ def pyramid(
     count = len(images.mask)
     own = [_texture(grey, level) for level in range(levels)]
     pixel, p_cam, measured = _steepest(own[0], depth, cfg.track.brightness.pixels, camera)
-    each = len(measured) // count
+    each = -(-len(measured) // count)
 
     def shared_out(values):
-        """Every K-th for the first of K images, the next ones for the second, and so on."""
-        return values[: each * count].reshape(each, count, *values.shape[1:]).swapaxes(0, 1)
+        """Every K-th for the first of K images, the next ones for the second, and so on; filled up with nothing."""
+        filled = jnp.pad(values, [(0, each * count - len(values)), *[(0, 0)] * (values.ndim - 1)])
+        return filled.reshape(each, count, *values.shape[1:]).swapaxes(0, 1)
 
     p_cam, measured = shared_out(p_cam), shared_out(measured)
     noise, found = jnp.full(count, cfg.track.brightness.noise), []
@@ -96,27 +102,29 @@ def _steepest(
     where it is in the image (u, v), the point that it shows, and whether there is one that is steep."""
     every = round(camera.width / depth.shape[1])
     steepness = jnp.sum(texture[::every, ::every, 1:] ** 2, -1)
-    steepness = jnp.where(_on_one_surface(depth) & (steepness > STEEP**2), steepness, 0)
-    rows, columns = grid_shape(pixels, *depth.shape)
-    high, wide = depth.shape[0] // rows, depth.shape[1] // columns
-    cells = steepness[: rows * high, : columns * wide].reshape(rows, high, columns, wide)
-    cells = cells.swapaxes(1, 2).reshape(rows * columns, high * wide)
-    best = jnp.argmax(cells, -1)
-    cell = jnp.arange(rows * columns)
+    steep = _on_one_surface(depth, -(-REACH_PX // every)) & (steepness > STEEP**2)
+    steepness = jnp.where(steep, steepness, 0)
+    (height, width), (rows, columns) = depth.shape, grid_shape(pixels, *depth.shape)
+    high, wide = -(-height // rows), -(-width // columns)
+    rows, columns = -(-height // high), -(-width // wide)
+    # Cells are whole: the last ones reach beyond the image, where nothing is steep
+    whole = jnp.pad(steepness, ((0, rows * high - height), (0, columns * wide - width)))
+    cells = whole.reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows * columns, high * wide)
+    best, cell = jnp.argmax(cells, -1), jnp.arange(rows * columns)
     v, u = cell // columns * high + best // wide, cell % columns * wide + best % wide
     p_cam = rays(v, u, camera.decimated(every)) * depth[v, u][:, None]
     pixel = every * jnp.stack([u, v], -1).astype(jnp.float32)
     return pixel, p_cam, jnp.max(cells, -1) > 0
 
 
-def _on_one_surface(depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Pixels whose neighbours were measured and are about as far away: beside an edge of depth, one does not know which
-    side a change of brightness belongs to."""
-    padded = jnp.pad(depth, 1)
-    (height, width), there = depth.shape, depth > 0
-    for v, u in ((0, 1), (2, 1), (1, 0), (1, 2)):
-        beside = jax.lax.dynamic_slice(padded, (v, u), (height, width))
-        there &= jnp.abs(beside - depth) < JUMP * depth
+def _on_one_surface(depth: Float[Array, "h w"], reach: int) -> Bool[Array, "h w"]:
+    """Pixels whose neighbours, up to so many away, were measured and are about as far off: beside an edge of depth, one
+    does not know which side a change of brightness belongs to."""
+    padded, there = jnp.pad(depth, reach), depth > 0
+    for off in (*range(-reach, 0), *range(1, reach + 1)):
+        for v, u in ((off, 0), (0, off)):
+            beside = jax.lax.dynamic_slice(padded, (reach + v, reach + u), depth.shape)
+            there &= jnp.abs(beside - depth) < JUMP * depth
     return there
 
 
@@ -163,9 +171,8 @@ def _rows(T: Float[Array, "4 4"], seen: Shades, camera: Intrinsics, cfg: Config)
     metres = cfg.sensor.noise_floor * jax.lax.rsqrt(compared.variance)
     error = metres * compared.error
     scale = wanted.robust * cfg.sensor.noise_floor
-    # A point that no image shows costs as much as one whose error is as large as its scale
-    cost = scale**2 * jnp.where(compared.mask, jnp.log1p((error / scale) ** 2), jnp.log(2.0))
-    cost = cost * (seen.measured & seen.images.mask[:, None])
+    off = jnp.where(compared.mask, jnp.minimum(jnp.abs(error) / scale, LOST), LOST)
+    cost = scale**2 * jnp.log1p(off**2) * (seen.measured & seen.images.mask[:, None])
     weight = compared.robust * compared.mask
     return Rows(error, metres[..., None] * compared.jacobian, wanted.weight * weight, wanted.weight * cost)
 
@@ -201,14 +208,12 @@ def _evened(there, here, jacobian, variance, shown, cfg: Config) -> _Compared:
     difference, robust = there - here, jnp.ones_like(here)
 
     def without_light(values):
-        """Less what gain and offset explain of them; a weak prior tells these apart where all points are as bright."""
+        """Less what gain and offset explain of them; a weak prior keeps both where there is little to tell them by."""
         weight = robust * shown / variance
-        squares, sums, total = jnp.sum(weight * here**2) + 1, jnp.sum(weight * here), jnp.sum(weight) + 1
-        on_gain, on_offset = (weight * here) @ values, weight @ values
-        determinant = squares * total - sums**2
-        gain = (total * on_gain - sums * on_offset) / determinant
-        offset = (squares * on_offset - sums * on_gain) / determinant
-        return values - jnp.outer(here, gain) - offset[None]
+        total = jnp.sum(weight) + 1
+        centred, offset = here - weight @ here / total, weight @ values / total
+        gain = (weight * centred) @ values / (jnp.sum(weight * centred**2) + 1)
+        return values - jnp.outer(centred, gain) - offset[None]
 
     error = without_light(difference[:, None])[:, 0]
     for _ in range(2):

@@ -22,6 +22,9 @@ from mipsjax.core.photometric import Images, brightness_system, pyramid, with_no
 from mipsjax.core.solvers import Landmarks, landmark_system, steady_hessian, view_errors, view_rows
 from mipsjax.core.views import Views
 
+LEVELS = 2
+"""Of the pyramid of images: a pair is known to a few pixels before."""
+
 
 class Shown(NamedTuple):
     """P pairs of images."""
@@ -93,10 +96,10 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
         found = System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
         if pair.landmarks is not None:
             corners = landmark_system(T, pair.landmarks, camera, cfg)
-            found = jax.tree.map(lambda all, part: all + part / cfg.track.held.corners, found, corners)
+            found = jax.tree.map(lambda total, part: total + part / cfg.track.held.corners, found, corners)
         if seen is not None:
             shade = brightness_system(T, seen, camera, cfg)
-            found = jax.tree.map(lambda all, part: all + part / cfg.track.held.brightness, found, shade)
+            found = jax.tree.map(lambda total, part: total + part / cfg.track.held.brightness, found, shade)
         return jax.tree.map(lambda part: trust * part, found)
 
     def on_both(T, seen):
@@ -109,7 +112,7 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     T, seen = pair.T_first_second, None
     if pair.shown is not None:
         first, grey = pair.shown.first, pair.shown.second.astype(jnp.float32)
-        seen, coarse = pyramid(first, grey, pair.second, 2, camera, cfg)
+        seen, coarse = pyramid(first, grey, pair.second, LEVELS, camera, cfg)
         T = descend(partial(on_both, seen=coarse), T, cfg.track.brightness.coarse_steps)
         seen = with_noise(seen, T, camera, cfg)
     T = descend(partial(on_both, seen=seen), T, cfg.track.go.steps)

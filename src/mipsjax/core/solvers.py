@@ -59,7 +59,7 @@ class Landmarks(NamedTuple):
 
 class Information(NamedTuple):
     """How firmly a frame is held: inverse covariances of its pose, for a twist (v, omega) in the camera's frame,
-    1/m^2 and 1/rad^2, as if each point and corner erred alone."""
+    1/m^2 and 1/rad^2, as if each point, corner and pixel erred alone."""
 
     surfaces: Float[Array, "6 6"]
     """By the map and the depth images of keyframes."""
@@ -172,14 +172,15 @@ def information(
 
     surfaces = mean_precision(points, cfg) * steady_hessian(parts, moved)
     close_by = 1 / cfg.sensor.noise_floor**2
-    # Points weigh relative to each other, corners relative to points: here each by what it is worth
+    # Points weigh relative to each other, colour relative to points: here each by what it is worth
     corners, brightness = _of_colour(T, seen, camera, cfg)
+    both = (corners, cfg.track.held.corners), (brightness, cfg.track.held.brightness)
     return Information(
         close_by * surfaces,
         close_by * corners.hessian,
         close_by * brightness.hessian,
         _step(*(part.system() for part in parts)),
-        _step(corners, brightness),
+        _step(*(jax.tree.map(lambda part, n=n: part / n, system) for system, n in both)),
     )
 
 

@@ -28,7 +28,7 @@ RECENT = 50
 STEPS = np.geomspace(1, 1e-4, 81)
 """Of trust that are tried, from all of it downwards."""
 ROUNDING = 1e-5
-"""Of the information of colour, relative to the largest: single precision knows no better."""
+"""Of an information, relative to the largest: single precision knows no better."""
 MATCHED = 0.3
 """Least share of a frame's points on surfaces of the other, so that these hold the pair without colour."""
 
@@ -56,9 +56,9 @@ def differing(
     twist, surfaces, colour = (np.asarray(part, np.float64) for part in (twist, surfaces, colour))
     if not all(np.isfinite(part).all() for part in (surfaces, colour, twist)):
         return None
-    strength = np.linalg.eigvalsh(colour)
-    if strength[0] <= ROUNDING * strength[-1] or np.linalg.eigvalsh(surfaces)[0] <= 0:
-        return None
+    for strength in map(np.linalg.eigvalsh, (surfaces, colour)):
+        if strength[0] <= ROUNDING * strength[-1]:
+            return None
     root = np.linalg.cholesky(surfaces)
     ratio, directions = np.linalg.eigh(root.T @ np.linalg.inv(colour) @ root)
     return Differing((directions.T @ root.T @ twist) ** 2, np.maximum(ratio, 0))
