@@ -31,6 +31,9 @@ from mipsjax.core.solvers import (
 )
 from mipsjax.core.views import Views, observed
 
+ENOUGH = (
+    100  # corners that say where the camera is to a pixel or two: no coarse level of images is needed then
+)
 BEHIND = 0.3  # metres behind what a keyframe saw, to which its surface may still be that of a frame not yet registered
 
 
@@ -127,16 +130,21 @@ def track(
     # So weak that it counts only where nothing else holds the frame
     prior = Prior(start, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
 
-    finest, coarser = None, []
-    if images is not None:
-        finest, *coarser = pyramid(images, grey_of(color), depth, LEVELS, camera, cfg)
+    def compared(levels):
+        """With earlier frames, the finest level first."""
+        return [] if images is None else pyramid(images, grey_of(color), depth, levels, camera, cfg)
 
     def closer(T):
         """By images and depth images of earlier frames alone, from coarse to fine."""
-        for level in reversed(coarser):
+        for level in reversed(compared(LEVELS)[1:]):
             seen = Evidence(coarse, views, landmarks, level, trust, prior)
             T = approach(T, seen, cfg.track.brightness.coarse_steps, camera, cfg)
         return T
+
+    finest = next(iter(compared(1)), None)
+    few = jnp.bool_(images is not None)
+    if landmarks is not None:
+        few &= jnp.sum(landmarks.mask) < ENOUGH
 
     def evidence(T):
         """Of the frame about at T."""
@@ -154,7 +162,6 @@ def track(
         if go.method == "adam":
             T = adam(field, T, points, k_adam, cfg)
         elif go.method == "lm":
-            T = closer(T)
             T = levenberg_marquardt(field, T, evidence(T), "whole", go.steps, camera, cfg)
         return T, measure_fit(field, T, points, "whole", cfg)
 
@@ -182,7 +189,8 @@ def track(
     if ro.when == "always":
         T, after = searched(start)
     else:
-        found = near(start)
+        # Where that leads astray, the attempts that follow begin anew
+        found = near(start if images is None else jax.lax.cond(few, closer, lambda T: T, start))
         if smooth:
             found, _ = tried(far, found)
         if ro.when == "needed":

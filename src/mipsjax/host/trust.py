@@ -41,8 +41,9 @@ class Differing(NamedTuple):
     ratio: Float64[np.ndarray, "*N 6"]
     """Variance of the pose by colour, where this has all trust, over that by surfaces."""
 
-    def contradiction(self, trust: float) -> Float64[np.ndarray, "*N"]:
-        """The mean square of the difference, in deviations that are expected of it; 1 if these were exact."""
+    def contradiction(self, trust: float | Float64[np.ndarray, "S 1 1"]) -> Float64[np.ndarray, "*N"]:
+        """The mean square of the difference, in deviations that are expected of it; 1 if these were exact. Of several
+        trusts one row each."""
         return np.mean(self.squares / (1 + self.ratio / trust), -1)
 
 
@@ -78,7 +79,6 @@ def trusted(differences: Sequence[Differing], allowed: float) -> float:
     if len(differences) < FEWEST:
         return 1.0
     together = Differing(*(np.stack(parts) for parts in zip(*differences, strict=True)))
-    for trust in STEPS:
-        if np.median(together.contradiction(trust)) <= allowed:
-            return float(trust)
-    return float(STEPS[-1])
+    usual = np.median(together.contradiction(STEPS[:, None, None]), -1)
+    enough = np.flatnonzero(usual <= allowed)
+    return float(STEPS[enough[0] if len(enough) else -1])
