@@ -7,7 +7,7 @@ Of each sequence so many pairs of frames, spread evenly, one and eight frames ap
 goes on as before, are true ones. Forms: surfaces (depth images alone), corners and brightness (each alone: trusted a
 hundred million times as much as usual), and these with surfaces. Errors are those of the later frame's pose in the
 earlier one's camera, median and ninth tenth. Writes `colour.csv`, of one sequence (`--only`) its rows anew; `--table`
-prints its rows for docs/trials.md.
+prints it for docs/trials.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from common import DATA, Altered, changed, print_table, read_rows, show, write_rows
+from common import DATA, Altered, changed, read_rows, show, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.core import relative
@@ -126,6 +126,15 @@ def measured(before: Frame, now: Frame, guess: Pose, sequence: Sequence, form: F
     return np.asarray(found.T_first_second[0], np.float64)
 
 
+def print_forms(found: list[dict[str, str]]) -> None:
+    """A row for each sequence and distance, a column for each form: median and ninth tenth of the errors, mm."""
+    print("| sequence | frames apart | " + " | ".join(FORMS) + " |\n" + "|---" * (2 + len(FORMS)) + "|")
+    for name, apart in dict.fromkeys((row["sequence"], row["apart"]) for row in found):
+        of = {row["form"]: row for row in found if (row["sequence"], row["apart"]) == (name, apart)}
+        cells = (f"{float(of[form]['error_mm']):.2g}, {float(of[form]['error_9_mm']):.2g}" for form in FORMS)
+        print(f"| {name} | {apart} | " + " | ".join(cells) + " |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -135,7 +144,7 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
     if options.table:
-        print_table("colour")
+        print_forms(read_rows("colour"))
         return
     enable_cache()
     # The steps alone are to be compared: they go on to the end
