@@ -109,9 +109,9 @@ def track(
 
     `views` are depth images of keyframes, decimated by a whole factor, that the second-order steps on the fine
     field also align the frame to. `landmarks` are corners of earlier frames, which these steps keep where the frame
-    shows them, and `images` are the same frames as they looked: by these and `views` it comes near before the map is
-    asked. `trust` is what both count for, of what they would. `known` are more keyframes: the second-order steps trust
-    the field only where these observed something.
+    shows them, and `images` are the same frames as they looked: where landmarks are few, it comes near by these and
+    `views` before the map is asked. `trust` is what landmarks and images count for, of what they would. `known` are
+    more keyframes: the second-order steps trust the field only where these observed something.
 
     The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
     field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
