@@ -17,9 +17,16 @@ from jaxtyping import Array, Float, UInt8
 from mipsjax.config import Config
 from mipsjax.core import losses
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
-from mipsjax.core.equations import Points, Prior, System, descend, mean_precision, prior_system
-from mipsjax.core.photometric import Images, brightness_system, pyramid, with_noise
-from mipsjax.core.solvers import Landmarks, landmark_system, steady_hessian, view_errors, view_rows
+from mipsjax.core.equations import Points, Prior, descend, mean_precision, prior_system
+from mipsjax.core.photometric import Images, pyramid, with_noise
+from mipsjax.core.solvers import (
+    Landmarks,
+    as_independent,
+    colour_systems,
+    steady_hessian,
+    view_errors,
+    view_rows,
+)
 from mipsjax.core.views import Views
 
 LEVELS = 2
@@ -93,14 +100,8 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
         return jax.tree.map(lambda part, weak: of_points * part + weak, system, expected)
 
     def on_images(T, seen):
-        found = System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
-        if pair.landmarks is not None:
-            corners = landmark_system(T, pair.landmarks, camera, cfg)
-            found = jax.tree.map(lambda total, part: total + part / cfg.track.held.corners, found, corners)
-        if seen is not None:
-            shade = brightness_system(T, seen, camera, cfg)
-            found = jax.tree.map(lambda total, part: total + part / cfg.track.held.brightness, found, shade)
-        return jax.tree.map(lambda part: trust * part, found)
+        both = colour_systems(T, pair.landmarks, seen, camera, cfg)
+        return jax.tree.map(lambda part: trust * part, as_independent(*both, cfg))
 
     def on_both(T, seen):
         return jax.tree.map(jnp.add, on_surfaces(T), on_images(T, seen))

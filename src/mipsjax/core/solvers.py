@@ -125,7 +125,9 @@ def approach(
 
 def _without_map(T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config) -> list[System]:
     """Normal equations of all that there is beside the map."""
-    colour = jax.tree.map(lambda *parts: seen.trust * sum(parts), *_of_colour(T, seen, camera, cfg))
+    colour = jax.tree.map(
+        lambda *parts: seen.trust * sum(parts), *colour_systems(T, seen.landmarks, seen.shades, camera, cfg)
+    )
     found = [colour]
     if seen.views is not None:
         found.append(view_rows(T, seen.points, seen.views, camera, cfg).system())
@@ -134,16 +136,26 @@ def _without_map(T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg
     return found
 
 
-def _of_colour(
-    T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config
+def colour_systems(
+    T: Float[Array, "4 4"],
+    landmarks: Landmarks | None,
+    shades: Shades | None,
+    camera: Intrinsics,
+    cfg: Config,
 ) -> tuple[System, System]:
     """Normal equations of corners and of brightness, zero where there are none."""
     corners = brightness = System(jnp.zeros(()), jnp.zeros((6, 6)), jnp.zeros(6))
-    if seen.landmarks is not None:
-        corners = landmark_system(T, seen.landmarks, camera, cfg)
-    if seen.shades is not None:
-        brightness = brightness_system(T, seen.shades, camera, cfg)
+    if landmarks is not None:
+        corners = landmark_system(T, landmarks, camera, cfg)
+    if shades is not None:
+        brightness = brightness_system(T, shades, camera, cfg)
     return corners, brightness
+
+
+def as_independent(corners: System, brightness: System, cfg: Config) -> System:
+    """Both together, as if those that err together were one (`track.held`)."""
+    held = cfg.track.held
+    return jax.tree.map(lambda c, b: c / held.corners + b / held.brightness, corners, brightness)
 
 
 def information(
@@ -173,14 +185,13 @@ def information(
     surfaces = mean_precision(points, cfg) * steady_hessian(parts, moved)
     close_by = 1 / cfg.sensor.noise_floor**2
     # Points weigh relative to each other, colour relative to points: here each by what it is worth
-    corners, brightness = _of_colour(T, seen, camera, cfg)
-    both = (corners, cfg.track.held.corners), (brightness, cfg.track.held.brightness)
+    corners, brightness = colour_systems(T, seen.landmarks, seen.shades, camera, cfg)
     return Information(
         close_by * surfaces,
         close_by * corners.hessian,
         close_by * brightness.hessian,
         _step(*(part.system() for part in parts)),
-        _step(*(jax.tree.map(lambda part, n=n: part / n, system) for system, n in both)),
+        _step(as_independent(corners, brightness, cfg)),
     )
 
 
