@@ -10,8 +10,9 @@ hours: runs of which there is a row of the same code, the state of `src/` in git
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
 and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
-`kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `colour`, colour in
-tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
+`kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `wrong-depth`, depth
+that is not what a sequence says, measured along the ray or in whole metres, of which a run must say so; `colour`,
+colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
@@ -104,22 +105,55 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
         return [Task(group, "redkitchen", stride, seed=seed) for stride, seed in strides]
     if group == "blind":
         return [Task(group, name, switch="flat", seed=seed) for name, seed in product(large, seeds)]
+    if group == "wrong-depth":
+        switches = product(large, ("along-ray", "whole-metres"), seeds)
+        return [Task(group, name, switch=switch, seed=seed) for name, switch, seed in switches]
     if group == "no-pairs":
         names = (("bookstore", 1), ("corridor_walk", 1), ("small_house/living", 1), ("redkitchen", 8))
         return [Task(group, *name, switch="no-pairs", seed=seed) for name, seed in product(names, seeds)]
     assert group == "colour"
     real = (("redkitchen", 4), ("rgbd_dataset_freiburg3_excerpt", 1))
-    switches = product(real, ("full", "no-colour"), seeds)
-    return [Task(group, name, stride, switch, seed) for (name, stride), switch, seed in switches]
+    runs = product(real, ("full", "no-colour"), seeds)
+    return [Task(group, name, stride, switch, seed) for (name, stride), switch, seed in runs]
 
 
-GROUPS = ("large", "homes", "tuning", "loops", "rooms", "kitchen", "blind", "colour", "no-pairs")
+GROUPS = (
+    "large",
+    "homes",
+    "tuning",
+    "loops",
+    "rooms",
+    "kitchen",
+    "blind",
+    "wrong-depth",
+    "colour",
+    "no-pairs",
+)
 
 
 def flat(sequence: Sequence, place: int) -> Frame:
     """With an image that shows nothing."""
     frame = sequence[place]
     return frame if frame.color is None else frame._replace(color=np.full_like(frame.color, FLAT))
+
+
+def along_the_ray(sequence: Sequence, place: int) -> Frame:
+    """With distances from the camera where depth along its axis should be."""
+    frame, camera = sequence[place], sequence.intrinsics
+    if frame.depth is None:
+        return frame
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    longer = np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+    return frame._replace(depth=(frame.depth * longer).astype(np.float32))
+
+
+def in_whole_metres(sequence: Sequence, place: int) -> Frame:
+    frame = sequence[place]
+    return frame if frame.depth is None else frame._replace(depth=np.round(frame.depth))
+
+
+ALTERED = {"flat": flat, "along-ray": along_the_ray, "whole-metres": in_whole_metres}
 
 
 def configuration(switch: str) -> Config:
@@ -134,11 +168,12 @@ def done(task: Task) -> dict[str, Any]:
     enable_cache()
     path = task.name if ":" in task.name else str(DATA / task.name)
     cfg = configuration(task.switch)
-    frames = slice(None, None, task.stride)
-    if task.switch == "flat":
-        found = run(path, cfg, frames=frames, seed=task.seed, see=lambda seen: Altered(seen, flat))
-    else:
-        found = run(path, cfg, frames=frames, seed=task.seed)
+    frames, altered = slice(None, None, task.stride), ALTERED.get(task.switch)
+
+    def see(seen: Sequence) -> Sequence:
+        return seen if altered is None else Altered(seen, altered)
+
+    found = run(path, cfg, frames=frames, seed=task.seed, see=see)
     row = task._asdict() | found.row | {"sequence": task.name.removeprefix("synth:")}
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share
@@ -338,6 +373,7 @@ COLUMNS = {
     "wrong_ok": "ok and over 30 cm off",
     "within_3_deviations": "within 3 deviations",
     "looked_through": "looked through",
+    "contradicted": "depth contradicts itself",
     "submaps": "submaps",
     "loops_true": "true loops",
     "loops_found": "found",
@@ -359,13 +395,47 @@ run held to one core; `code` is the state of `src/` in git, `git rev-parse --sho
 """
 
 
+def in_sum(rows: list[dict[str, str]]) -> str:
+    """What the runs of a group say together, one line for each kind of sequence and switch."""
+
+    def column(key: str) -> np.ndarray:
+        values = np.array([float(row.get(key) or "nan") for row in chosen])
+        return values[np.isfinite(values)]
+
+    lines = []
+    for kind in dict.fromkeys(map(_kind, rows)):
+        chosen = [row for row in rows if _kind(row) == kind]
+        ate, true = column("ate_cm"), int(column("loops_true").sum())
+        words = [f"{len(chosen)} runs", f"ATE {ate.mean():.2f} cm in the mean and {ate.max():.2f} at most"]
+        words.append(
+            f"{int(column('lost').sum())} frames lost, {int(column('wrong_ok').sum())} `ok` and far off"
+        )
+        found, false = (int(column(f"loops_{key}").sum()) for key in ("found", "false"))
+        words.append(f"{found} of {true} true loops found, {false} false kept")
+        near, elsewhere = column("near_change_mm"), column("elsewhere_mm")
+        if len(near):
+            words.append(
+                f"near a change of submap {near.mean() / elsewhere.mean():.2f} times as far off as elsewhere"
+            )
+        lines.append(f"- {kind}: " + "; ".join(words))
+    return "\n".join(lines) + "\n"
+
+
+def _kind(row: Mapping[str, str]) -> str:
+    """Homes are slow or fast; others are of their own kind."""
+    name = row["sequence"]
+    if name.startswith("home-"):
+        name = "fast homes" if "-fast" in name else "slow homes"
+    return name if row["switch"] == "full" else f"{name}, {row['switch']}"
+
+
 def write_page() -> Path:
     rows = read_rows("held", RESULTS)
     parts = [PAGE]
     for group in dict.fromkeys(row["group"] for row in rows):
         chosen = [row for row in rows if row["group"] == group]
         shown = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in chosen)}
-        parts.append(f"## {group.capitalize()}\n")
+        parts += [f"## {group.capitalize()}\n", in_sum(chosen)]
         parts.append("| " + " | ".join(shown.values()) + " |\n" + "|---" * len(shown) + "|")
         parts += ["| " + " | ".join(row.get(key, "") for key in shown) + " |" for row in chosen]
         parts.append("")

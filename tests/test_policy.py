@@ -24,6 +24,7 @@ PLAIN = FrameStats(
     known=0.9,
     confirmed=0.8,
     open=0.002,
+    off=0.01,
     residual=0.01,
     least_residual=0.008,
     unsure=False,
@@ -89,7 +90,8 @@ def test_a_frame_that_fits_worse_than_the_sensor_explains_is_lost():
 
 def test_a_frame_with_hardly_any_depth_is_weak_and_teaches_nothing():
     few = PLAIN._replace(measured=0.049, translation=9.0)
-    assert decide(few, CFG) == Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
+    nothing = Decision(Status.WEAK, keyframe=False, map_steps=0, pose_rate=0.0, trouble=True, tells=False)
+    assert decide(few, CFG) == nothing
     assert decide(few._replace(known=0.1), CFG).status is Status.LOST
     assert decide(few._replace(measured=0.051), CFG).status is Status.OK
 
@@ -128,6 +130,20 @@ def test_nothing_is_learned_from_a_lost_frame():
 def test_a_weak_frame_is_mapped():
     decision = decide(PLAIN._replace(known=0.5), CFG)
     assert decision.status is Status.WEAK and decision.keyframe and decision.map_steps > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "trouble"),
+    [
+        ({"open": 0.029, "off": 0.09}, Status.OK, False),
+        ({"open": 0.031}, Status.WEAK, True),
+        # Held by what it sees, but since a slide nobody knows where: the next search need not be wider
+        ({"off": 0.11}, Status.WEAK, False),
+    ],
+)
+def test_a_frame_that_may_be_elsewhere_is_weak(change, status, trouble):
+    decision = decide(PLAIN._replace(**change), CFG)
+    assert (decision.status, decision.trouble) == (status, trouble) and decision.tells
 
 
 def test_the_papers_spacing_of_keyframes():

@@ -11,24 +11,27 @@ from mipsjax.core.solvers import Information
 from mipsjax.core.tracking import TrackInfo
 from mipsjax.data.sequence import Frame
 from mipsjax.host.corners import Corners
-from mipsjax.host.held import NONE, Directions, at
+from mipsjax.host.held import NONE, Directions, Gains, at
 from mipsjax.landmarks import Seen
 from mipsjax.policy import Status
 from mipsjax.state import SlamState
-from mipsjax.tracker import _carried_on, _information, _reference, coasting
+from mipsjax.tracker import _believed, _information, _reference, coasting
 
 CFG = Config()
 T_EXPECTED = maps.pose((10.0, 20.0, 30.0), (1.0, 2.0, 3.0))
 
 
-@pytest.mark.parametrize(("open_m", "followed"), [(0.02, 0.0), (0.05, 1.0), (1.0, 1.0)])
-def test_along_what_nothing_holds_a_frame_goes_on_as_expected(open_m, followed):
+@pytest.mark.parametrize(("open_m", "followed"), [(0.005, 0.0), (0.02, 0.75), (1.0, 1.0)])
+def test_along_what_measurements_leave_loose_a_frame_goes_on_as_far_as_that_says_more(open_m, followed):
     found = T_EXPECTED @ maps.pose(translation=(0.05, 0.03, 0.0))
     deviation = np.array([*[0.001] * 5, open_m])
     together = Directions(deviation, np.roll(np.eye(6), -1, axis=0))
-    moved = _carried_on(found, T_EXPECTED, together, CFG)
-    left = (np.linalg.inv(T_EXPECTED) @ moved)[:3, 3]
+    share = np.diag([1 - followed, *[0.9] * 5])
+    moved = _believed(found, T_EXPECTED, together, Gains(share, share / 2), CFG)
+    left, going = ((np.linalg.inv(T_EXPECTED) @ T)[:3, 3] for T in moved)
+    # Where it is firmly held it is where it was found, also where the motion before would have a word
     np.testing.assert_allclose(left, [0.05 * (1 - followed), 0.03, 0.0], atol=1e-12)
+    np.testing.assert_allclose(going[0], left[0] / 2 if followed else 0.05, atol=1e-12)
 
 
 def test_a_camera_that_may_be_elsewhere_is_measured_against_the_frame_before():
@@ -41,13 +44,16 @@ def test_a_camera_that_may_be_elsewhere_is_measured_against_the_frame_before():
     seen = Seen(reference, np.eye(4), None)  # pyright: ignore[reportArgumentType]
     for held, status, found, expected in (
         (sure, Status.OK, [], NONE),
-        (unsure, Status.OK, [], unsure.covariance),
+        (unsure, Status.OK, [], None),
         (unsure, Status.OK, [seen], loose),
         (unsure, Status.SKIPPED, [], NONE),
     ):
         record = state.records[-1]._replace(held=held, status=status)
-        there = _reference(state._replace(records=(record,)), keyframes, found)
-        np.testing.assert_array_equal(there, expected)
+        there = _reference(state._replace(records=(record,)), keyframes, found, CFG)
+        assert (there is None) == (expected is None)
+        np.testing.assert_array_equal(
+            NONE if there is None else there, NONE if expected is None else expected
+        )
 
 
 def test_a_camera_that_nobody_sees_may_be_anywhere_soon():

@@ -164,9 +164,14 @@ class HeldConfig:
     """m/s^2, standard deviation of a camera's, where nothing else says how it moves."""
     turn: float = 6.0
     """rad/s^2, the same."""
+    loose: float = 0.01
+    """Metres (or as many rad): along a direction that measurements leave open by this standard deviation, the motion
+    before says with them where the frame is."""
     weak: float = 0.03
-    """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation.
-    Along a bare corridor noise alone seems to hold a frame by 0.03 to 0.07."""
+    """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation."""
+    unsure: float = 0.1
+    """Metres: so is one where the camera may be this far off in its submap, standard deviation, after all that led
+    there; keyframes that seem near may then be elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ class Status(StrEnum):
 
     OK = "ok"
     WEAK = "weak"
-    """The next search is wider. Mapped, unless it has hardly any depth or was only found again."""
+    """Hardly held by what was measured, or since a frame that was not. Mapped, unless it has hardly any depth or was
+    only found again."""
     LOST = "lost"
     """Not mapped; its pose is the last trusted one."""
     SKIPPED = "skipped"
@@ -34,6 +35,8 @@ class FrameStats(NamedTuple):
     """The same where the map is certain."""
     open: float
     """Standard deviation, metres or rad, along the direction that measurements hold least."""
+    off: float
+    """Metres, standard deviation of where the camera is in its submap, after all that led there."""
     residual: float
     """Metres."""
     least_residual: float
@@ -62,21 +65,24 @@ class Decision(NamedTuple):
     map_steps: int
     pose_rate: float
     """Share of the pose learning rate in local bundle adjustment."""
+    trouble: bool
+    """The next search is to be wider."""
     tells: bool
     """Its motion and residual say something about the frames to come."""
 
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
-    status = _status(stats, cfg)
+    status, trouble = _status(stats, cfg), _is_weak(stats, cfg)
     if status is Status.LOST or _is_sparse(stats, cfg):
-        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0, tells=False)
+        return Decision(status, keyframe=False, map_steps=0, pose_rate=0.0, trouble=True, tells=False)
     share = _motion_share(stats, cfg)
     return Decision(
         status,
         keyframe=_is_keyframe(stats, cfg),
         map_steps=round(_between(cfg.map.steps_slow, cfg.map.steps, share)),
         pose_rate=_between(cfg.map.pose_rate_slow, 1.0, share),
+        trouble=trouble,
         tells=True,
     )
 
@@ -120,8 +126,14 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
+    unsure = stats.off > cfg.track.held.unsure
+    return Status.WEAK if _is_weak(stats, cfg) or unsure else Status.OK
+
+
+def _is_weak(stats: FrameStats, cfg: Config) -> bool:
+    """Whether this frame by itself is."""
     loose = stats.open > cfg.track.held.weak
-    return Status.WEAK if stats.known < guard.weak or loose or _is_sparse(stats, cfg) else Status.OK
+    return stats.known < cfg.guard.weak or loose or _is_sparse(stats, cfg)
 
 
 def _allowed(stats: FrameStats, cfg: Config) -> float:

@@ -17,7 +17,7 @@ from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
 from mipsjax.host.features import detect
-from mipsjax.host.held import at
+from mipsjax.host.held import at, deviations
 from mipsjax.host.trust import RECENT
 from mipsjax.landmarks import corners_of, with_corners
 from mipsjax.policy import STAY, Decision, FrameStats, Status, decide
@@ -93,7 +93,7 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
         frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, tracked, decision, cfg)
     if decision.tells:
-        learned = with_corners(_moved_on(learned, state, stats.residual), frame, tracked.found, cfg)
+        learned = with_corners(_moved_on(learned, state, tracked, stats.residual), frame, tracked.found, cfg)
         if tracked.doubt is not None:
             learned = learned._replace(doubts=(*learned.doubts, tracked.doubt)[-RECENT:])
     state = learned
@@ -174,7 +174,7 @@ def _learn(
         depth=thumbnail(frame.depth, state.camera),
         colour=tracked.info.information.corners + tracked.info.information.brightness,
     )
-    trouble = 0 if decision.status is Status.OK else state.trouble + 1
+    trouble = state.trouble + 1 if decision.trouble else 0
     return state._replace(records=(*state.records, record), trouble=trouble)
 
 
@@ -205,10 +205,11 @@ def _coast(
     return state._replace(records=(*state.records, record), trouble=state.trouble + 1)
 
 
-def _moved_on(state: SlamState, before: SlamState, residual: float) -> SlamState:
+def _moved_on(state: SlamState, before: SlamState, tracked: Tracked, residual: float) -> SlamState:
     """With motion and residual after a trusted frame."""
     newest, older = state.records[-1], last_trusted(before)
     T_older_newer = inverse(pose_of(state, before.records[-1])) @ pose_of(state, newest)
+    T_older_newer = T_older_newer @ inverse(tracked.T_sub_cam) @ tracked.T_as_moved
     motion = Motion(T_older_newer, newest.timestamp - older.timestamp)
     over = max(residual - before.residual, 0.0)
     floor = min(residual, before.residual + RESIDUAL_RISE * over) if before.residual else residual
@@ -226,6 +227,7 @@ def _stats(state: SlamState, depth: np.ndarray, tracked: Tracked) -> FrameStats:
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
         open=float(tracked.together.deviation[-1]),
+        off=deviations(tracked.held.covariance, T_sub_cam)[0],
         residual=float(info.after.residual),
         least_residual=state.residual,
         unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),

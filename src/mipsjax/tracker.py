@@ -13,14 +13,13 @@ from mipsjax.bundle import TRACK, nearest, random_key, views_of
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.data.sequence import Frame
-from mipsjax.host.held import NONE, Directions, Held, Matrix, at, directions, held, of_turns, predicted
+from mipsjax.host.held import NONE, Directions, Gains, Held, Matrix, at, directions, gains, held, predicted
 from mipsjax.host.trust import ALLOWED_TRACKED, Differing, differing, trusted
 from mipsjax.landmarks import Seen, follow_all, images_of, landmarks, placed
 from mipsjax.policy import Status, converged, widening
 from mipsjax.state import Keyframe, Pose, Record, SlamState, deviations_of, distance, last_pose, rigid
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
-SURE_M = 0.1  # standard deviation of where the camera is up to which it is surely beside the keyframes that seem near
 TRUSTED = (Status.OK, Status.WEAK)
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
@@ -29,6 +28,8 @@ class Tracked(NamedTuple):
     """What tracking says of a frame."""
 
     T_sub_cam: Pose
+    T_as_moved: Pose
+    """Where its motion led; the pose itself but for what measurements leave loose."""
     info: tracking.TrackInfo
     found: list[Seen]
     """Corners of earlier frames."""
@@ -72,15 +73,14 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     )
     T, info = jax.device_get((T, info))
     surfaces, colour = _information(info, cfg)
-    reference, information = _reference(state, near, found), surfaces + trust * colour
-    together = directions(information)
-    T_sub_cam = _carried_on(rigid(T), T_as_before, together, cfg)
-    expected = _predicted(reference, state, frame, T_sub_cam, cfg)
-    if together.deviation[-1] > cfg.track.held.weak:
-        # What seems to hold a weak frame may be noise, the same in each frame, of which many would make a firm hold
-        information = of_turns(information)
+    information, found_at = surfaces + trust * colour, rigid(T)
+    reference, together = _reference(state, near, found, cfg), directions(information)
+    expected = _predicted(reference, state, frame, found_at, cfg)
+    gain = gains(reference, expected, found_at, information)
+    T_sub_cam, T_as_moved = _believed(found_at, T_as_before, together, gain, cfg)
     return Tracked(
         T_sub_cam,
+        T_as_moved,
         info,
         found,
         directions(surfaces),
@@ -97,29 +97,30 @@ def coasting(state: SlamState, frame: Frame, cfg: Config) -> Held:
     if last.status in TRUSTED:
         stopped = last._replace(held=at(last.held.covariance, T_sub_cam))
         state = state._replace(records=(*state.records[:-1], stopped))
-    return _predicted(NONE, state, frame, T_sub_cam, cfg)
+    return _predicted(None, state, frame, T_sub_cam, cfg)
 
 
-def _predicted(reference: Matrix, state: SlamState, frame: Frame, T_sub_cam: Pose, cfg: Config) -> Held:
+def _predicted(
+    reference: Matrix | None, state: SlamState, frame: Frame, T_sub_cam: Pose, cfg: Config
+) -> Held:
     last = state.records[-1]
     seconds = max(frame.timestamp - last.timestamp, DT_MIN)
     return predicted(reference, last.held, T_sub_cam, seconds, cfg.track.held)
 
 
-def _reference(state: SlamState, near: list[Keyframe], found: list[Seen]) -> Matrix:
-    """What the pose is off by that a frame is measured against: that of the best known keyframe nearby.
+def _reference(state: SlamState, near: list[Keyframe], found: list[Seen], cfg: Config) -> Matrix | None:
+    """What the pose is off by that a frame is measured against: that of the best known keyframe nearby; None for the
+    frame before.
 
-    Where the camera may be farther off than `SURE_M`, a keyframe that seems near may be elsewhere, unless the frame
-    shows its corners; then what the frame fits is what the map has learned of the one before, a moment ago.
+    Where the camera may be farther off than `track.held.unsure`, a keyframe that seems near may be elsewhere, unless
+    the frame shows its corners; then what the frame fits is what the map has learned of the one before, a moment ago.
     """
     last = state.records[-1]
     metres, _ = deviations_of(state, last)
-    known = [keyframe.covariance for keyframe in near]
-    if metres > SURE_M and last.status in TRUSTED:
+    if metres > cfg.track.held.unsure and last.status in TRUSTED:
         seen = {one.reference.record for one in found}
-        shown = [keyframe.covariance for keyframe in state.submap.keyframes if keyframe.number in seen]
-        known = [last.held.covariance, *shown]
-    return min(known, key=np.trace)
+        near = [keyframe for keyframe in state.submap.keyframes if keyframe.number in seen]
+    return min((keyframe.covariance for keyframe in near), key=np.trace, default=None)
 
 
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
@@ -133,18 +134,23 @@ def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]
     return surfaces, colour
 
 
-def _carried_on(T_sub_cam: Pose, T_as_before: Pose, together: Directions, cfg: Config) -> Pose:
-    """Along directions that nothing holds, where the motion before it leads."""
-    motion = np.linalg.inv(T_as_before) @ T_sub_cam
-    # To first order a twist: what is left open is a shift, or a small turn
+def _believed(
+    T_found: Pose, T_as_before: Pose, together: Directions, gain: Gains, cfg: Config
+) -> tuple[Pose, Pose]:
+    """Where the frame is, and where its motion led: as found, but along directions that measurements leave loose, where
+    the motion before says as much as it is known better."""
+    motion = np.linalg.inv(T_as_before) @ T_found
+    # To first order a twist: what is left loose is a shift, or a small turn
     off = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
-    open_ones = together.twist[together.deviation > cfg.track.held.weak]
-    if not len(open_ones):
-        return T_sub_cam
-    twist = -open_ones.T @ (open_ones @ off)
-    change = np.eye(4)
-    change[:3, :3], change[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
-    return T_sub_cam @ change
+    loose = together.twist[together.deviation > cfg.track.held.loose]
+    if not len(loose):
+        return T_found, T_found
+    poses = []
+    for share in gain:
+        twist, change = loose.T @ (loose @ (share @ off - off)), np.eye(4)
+        change[:3, :3], change[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
+        poses.append(T_found @ change)
+    return poses[0], poses[1]
 
 
 def _near(state: SlamState, cfg: Config) -> list[Keyframe]:

@@ -12,7 +12,8 @@ from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see, unprojecte
 
 from mipsjax.core import field as nf
 from mipsjax.core import solvers, tracking
-from mipsjax.core.views import Views, observed, plane_errors, planes_at
+from mipsjax.core.camera import rays
+from mipsjax.core.views import Views, observed, own_normals, plane_errors, planes_at
 
 KEY = jax.random.key(11)
 REACH = 0.1
@@ -47,6 +48,25 @@ def test_normals_are_those_of_the_walls(views):
     off = np.abs(inward[flat] - expected[flat]).max(1)
     # Differences of a float32 depth; next to an edge a neighbour may be on the other wall, nearly in the plane
     assert np.mean(off < 2e-3) > 0.98 and off.max() < 0.15
+
+
+def test_a_frames_own_normals_have_little_noise_and_small_parts_have_some():
+    """Of a wall that is 3 m away with a post in front of it, as wide as a few pixels."""
+    rng, growth = np.random.default_rng(0), 0.002
+    depth = np.full((CAMERA.height, CAMERA.width), 3.0)
+    depth[:, 40:46] = 2.0
+    depth = jnp.asarray(depth + growth * depth**2 * rng.standard_normal(depth.shape), jnp.float32)
+    v, u = (x.ravel() for x in np.mgrid[16 : CAMERA.height - 16 : 5, 16 : CAMERA.width - 16])
+    p_cam = rays(v, u, CAMERA) * depth[v, u][:, None]
+    own = np.asarray(own_normals(depth, p_cam, CAMERA, growth))
+    near = np.asarray(planes_at(depth, v, u, CAMERA, growth).normal)
+    on_wall, on_post = (u < 24) | (u > 62), (u > 41) & (u < 44)
+    assert (
+        np.linalg.norm(own[on_wall], axis=1).mean() > 0.9
+        and np.linalg.norm(own[on_post], axis=1).mean() > 0.5
+    )
+    known = on_wall & (np.linalg.norm(own, axis=1) > 0)
+    assert np.std(own[known, 0]) <= np.std(near[known, 0])
 
 
 def test_distances_to_the_walls_are_exact(views, on_walls):

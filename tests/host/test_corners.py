@@ -31,6 +31,21 @@ def test_corners_lie_on_the_surface_that_was_measured():
     np.testing.assert_allclose(image, found.pixel, atol=1e-3)  # float32 at 320 pixels
 
 
+@pytest.mark.parametrize("sigma", [0.0, 1.0, 3.0])
+def test_noise_has_no_corners(sigma):
+    """A bare wall in soft light, where a camera's noise is all that an eye for corners finds. A painted one
+    keeps its own."""
+    painted, depth = wall(np.eye(4), painting())
+    light = np.linspace(80, 160, depth.shape[1])[None] * np.ones_like(depth)
+
+    def taken(image):
+        noise = sigma * np.random.default_rng(0).standard_normal(image.shape)
+        return np.clip(np.round(image + noise), 0, 255).astype(np.uint8)
+
+    assert len(from_home(taken(light), depth).pixel) < 0.02 * COUNT
+    assert len(from_home(taken(painted), depth).pixel) > 0.7 * len(from_home(painted, depth).pixel)
+
+
 @pytest.mark.parametrize(("degrees", "metres"), MOTIONS)
 def test_the_motion_is_found_from_no_motion(degrees, metres):
     painted, truth = painting(), pose(degrees, metres)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float, UInt8
 
 from mipsjax.config import Config
@@ -27,7 +26,7 @@ from mipsjax.core.solvers import (
     view_errors,
     view_rows,
 )
-from mipsjax.core.views import Views
+from mipsjax.core.views import Views, own_normals
 
 LEVELS = 2
 """Of the pyramid of images: a pair is known to a few pixels before."""
@@ -106,10 +105,6 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     def on_both(T, seen):
         return jax.tree.map(jnp.add, on_surfaces(T), on_images(T, seen))
 
-    def moved(twist):
-        errors = view_errors(T @ jaxlie.SE3.exp(twist).as_matrix(), points, views, camera, cfg)
-        return [(errors.distance, errors.mask)]
-
     T, seen = pair.T_first_second, None
     if pair.shown is not None:
         first, grey = pair.shown.first, pair.shown.second.astype(jnp.float32)
@@ -119,7 +114,10 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     T = descend(partial(on_both, seen=seen), T, cfg.track.go.steps)
     surfaces, colour = on_surfaces(T), on_images(T, seen)
     # What the steps went by takes the noise of normals for a hold; what is stated does not
-    held = of_points * steady_hessian([view_rows(T, points, views, camera, cfg)], moved) + prior.weight
+    small = camera.decimated(round(camera.width / pair.second.shape[1]))
+    normals = own_normals(pair.second, points.p_cam, small, cfg.sensor.noise_growth)
+    rows = view_rows(T, points, views, camera, cfg)
+    held = of_points * steady_hessian([rows], points, normals) + prior.weight
     hit = view_errors(T, points, views, camera, cfg).mask[0].astype(jnp.float32)
     close_by = 1 / cfg.sensor.noise_floor**2
     return Relative(

@@ -6,7 +6,6 @@ T(xi) = T exp(xi).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -36,12 +35,8 @@ from mipsjax.core.views import PlaneErrors, Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
 VIEW_REACH = 0.1  # metres; a point farther from a keyframe's surface does not belong to it
-PROBED = 3  # weakest directions along which it is measured how firmly a frame is held
-PROBE = (
-    0.08  # metres by which the frame is moved for that: past the pixels that each normal is of, within reach
-)
-SURE = 2.0  # standard errors of that measurement by which the frame may be held less
-PROBE_REACH = 2.0  # metres from the camera at which a turn moves points by as much
+DOUBTED = 3  # weakest directions along which it is asked whether noise alone holds a frame
+SURE = 3.0  # standard errors of what is found there by which the frame may be held less
 
 
 class Landmarks(NamedTuple):
@@ -159,30 +154,20 @@ def as_independent(corners: System, brightness: System, cfg: Config) -> System:
 
 
 def information(
-    field: nf.Field, T: Float[Array, "4 4"], seen: Evidence, camera: Intrinsics, cfg: Config
+    field: nf.Field,
+    T: Float[Array, "4 4"],
+    seen: Evidence,
+    normals: Float[Array, "P 3"],
+    camera: Intrinsics,
+    cfg: Config,
 ) -> Information:
-    """What holds a frame at the pose that was found.
-
-    Normals are noisy: along a bare wall they seem to hold a frame that slides freely. Along the directions in which
-    the normal equations are weakest it is therefore measured how distances change when the frame is moved: the product
-    of noisy normals and of a change that does not know of this noise has the right mean. Its own noise is taken off.
-    """
+    """What holds a frame at the pose that was found. `normals` are those of its own depth image at the points, in the
+    camera's frame (`views.own_normals`)."""
     points = seen.points
-    on_map = map_rows(field, T, points, "whole", cfg)
-    on_views = None if seen.views is None else view_rows(T, points, seen.views, camera, cfg)
-    parts = [on_map] if on_views is None else [on_map, on_views]
-
-    def moved(twist):
-        """Distances there, and where there are any."""
-        T_moved = T @ jaxlie.SE3.exp(twist).as_matrix()
-        psi = nf.tsdf(field, transform(T_moved, points.p_cam), cfg.field, "whole").psi
-        there = [(psi, points.mask)]
-        if seen.views is not None:
-            errors = view_errors(T_moved, points, seen.views, camera, cfg)
-            there.append((errors.distance, errors.mask))
-        return there
-
-    surfaces = mean_precision(points, cfg) * steady_hessian(parts, moved)
+    parts = [map_rows(field, T, points, "whole", cfg)]
+    if seen.views is not None:
+        parts.append(view_rows(T, points, seen.views, camera, cfg))
+    surfaces = mean_precision(points, cfg) * steady_hessian(parts, points, normals)
     close_by = 1 / cfg.sensor.noise_floor**2
     # Points weigh relative to each other, colour relative to points: here each by what it is worth
     corners, brightness = colour_systems(T, seen.landmarks, seen.shades, camera, cfg)
@@ -201,30 +186,25 @@ def _step(*systems: System) -> Float[Array, "6"]:
     return -jnp.linalg.solve(together.hessian, together.slope)
 
 
-Distances = list[tuple[Float[Array, "*K P"], Bool[Array, "*K P"]]]
-"""For each part of the surfaces that points are measured against: of the points, and which of these are known."""
+def steady_hessian(parts: list[Rows], points: Points, normals: Float[Array, "P 3"]) -> Float[Array, "6 6"]:
+    """The Hessian of the points' distances to some surfaces, without what only noise makes of it.
 
-
-def steady_hessian(parts: list[Rows], moved: Callable[[Float[Array, "6"]], Distances]) -> Float[Array, "6 6"]:
-    """The Hessian of these parts together, without what only the noise of normals makes of it; `moved` gives the
-    distances after a twist."""
+    Normals are noisy, and surfaces that were learned have bumps: along a bare wall both seem to hold a frame that
+    slides freely. Surfaces and the frame's own `normals` do not know of each other's noise, so that the Hessian of
+    both has the right mean. Along the directions in which that is weakest only that counts, less its own noise.
+    """
     hessian = sum(part.system().hessian for part in parts)
-    strength, directions = jnp.linalg.eigh(hessian)
-
-    def measured(direction):
-        shift, turn = jnp.linalg.norm(direction[:3]), jnp.linalg.norm(direction[3:])
-        size = PROBE / jnp.maximum(shift, PROBE_REACH * turn)
-        forth, back = moved(size * direction), moved(-size * direction)
-        each = []
-        for part, (there, seen), (behind, seen_too) in zip(parts, forth, back, strict=True):
-            change = (seen & seen_too) * (there - behind)
-            each.append((part.weight * (part.jacobian @ direction) * change).reshape(-1))
-        strengths = jnp.concatenate(each) / (2 * size)
-        return jnp.sum(strengths) - SURE * jnp.linalg.norm(strengths)
-
-    weakest = directions[:, :PROBED].T
-    excess = strength[:PROBED] - jnp.maximum(jax.lax.map(measured, weakest), 0)
-    return hessian - jnp.einsum("k,ki,kj->ij", excess, weakest, weakest)
+    own = by_twist(points.p_cam, normals)
+    # A point's own noise is the same against each surface
+    each = [(part.weight[..., None] * part.jacobian).reshape(-1, *own.shape) for part in parts]
+    weighted = jnp.sum(jnp.concatenate(each), 0)
+    agreed = weighted.T @ own
+    strength, directions = jnp.linalg.eigh((agreed + agreed.T) / 2)
+    weakest = directions[:, :DOUBTED]
+    noise = jnp.linalg.norm((weighted @ weakest) * (own @ weakest), axis=0)
+    steady = jnp.maximum(strength[:DOUBTED] - SURE * noise, 0)
+    others = jnp.eye(6) - weakest @ weakest.T
+    return others @ hessian @ others + (weakest * steady[None]) @ weakest.T
 
 
 def view_rows(T: Float[Array, "4 4"], points: Points, views: Views, camera: Intrinsics, cfg: Config) -> Rows:
@@ -293,8 +273,12 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
     """Of distances with this gradient in the submap's frame."""
-    gradient = gradient @ T[:3, :3]
-    return jnp.concatenate([gradient, jnp.cross(points.p_cam, gradient)], -1)
+    return by_twist(points.p_cam, gradient @ T[:3, :3])
+
+
+def by_twist(p_cam: Float[Array, "P 3"], gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
+    """How what has this gradient in the camera's frame changes with a twist."""
+    return jnp.concatenate([gradient, jnp.cross(p_cam, gradient)], -1)
 
 
 def adam(

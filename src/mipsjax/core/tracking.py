@@ -29,7 +29,7 @@ from mipsjax.core.solvers import (
     levenberg_marquardt,
     map_rows,
 )
-from mipsjax.core.views import Views, observed
+from mipsjax.core.views import Views, observed, own_normals
 
 ENOUGH = (
     100  # corners that say where the camera is to a pixel or two: no coarse level of images is needed then
@@ -198,7 +198,9 @@ def track(
         T, after = found
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     T = jnp.where(ok, T, start)
-    return T, TrackInfo(before, after, information(field, T, evidence(T), camera, cfg), used_ro, ok)
+    normals = own_normals(depth, points.p_cam, camera, cfg.sensor.noise_growth)
+    holds = information(field, T, evidence(T), normals, camera, cfg)
+    return T, TrackInfo(before, after, holds, used_ro, ok)
 
 
 @partial(jax.jit, static_argnames=("camera", "cfg"))

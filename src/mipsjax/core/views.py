@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mipsjax.core.camera import Intrinsics, project, rays
 
 STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
+STEADY = 64  # the same, as a part of the image's width, where it matters more that a normal has little noise
 JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
 BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
 NOISE = 2.0  # deviations of the depth by which that may be more: in the noise of 3 m no plane is that even
@@ -80,6 +81,20 @@ def observed(
     return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
 
 
+def own_normals(
+    depth: Float[Array, "h w"], p_cam: Float[Array, "P 3"], camera: Intrinsics, noise_growth: float
+) -> Float[Array, "P 3"]:
+    """Unit normals, camera frame, of the surface that a depth image shows where its own points are, with as little
+    noise as its extent allows; 0 where it is no plane."""
+    height, width = depth.shape
+    pixel = _pixels(p_cam, jnp.eye(4), (height, width), camera)
+    normal = jnp.zeros_like(p_cam)
+    for step in (STEP, max(STEP, width // STEADY)):
+        planes = planes_at(depth, pixel.v, pixel.u, camera, noise_growth, step)
+        normal = jnp.where((planes.flat & pixel.inside)[:, None], planes.normal, normal)
+    return normal
+
+
 class _Pixels(NamedTuple):
     """Where P points fall in one image."""
 
@@ -107,9 +122,10 @@ def planes_at(
     u: Int[Array, " P"],
     camera: Intrinsics,
     noise_growth: float,
+    step: int = STEP,
 ) -> Planes:
-    """Points and normals at some pixels, from central differences of the depth image. `noise_growth` is that of its
-    depth (`SensorConfig`)."""
+    """Points and normals at some pixels, from central differences of the depth image over so many pixels to each side.
+    `noise_growth` is that of its depth (`SensorConfig`)."""
     height, width = depth.shape
 
     def point(dv, du):
@@ -117,7 +133,7 @@ def planes_at(
         return rays(vv, uu, camera) * depth[vv, uu][:, None]
 
     here = point(0, 0)
-    right, left, down, up = point(0, STEP), point(0, -STEP), point(STEP, 0), point(-STEP, 0)
+    right, left, down, up = point(0, step), point(0, -step), point(step, 0), point(-step, 0)
     normal = jnp.cross(down - up, right - left)
     squared = jnp.sum(normal**2, -1)
     exists = squared > 1e-18

@@ -34,6 +34,17 @@ ROUGHLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
 """When following ends there: the second round does the rest."""
 EXACTLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
 """When it ends in the second round, after so many steps or a step of so many pixels."""
+DISTINCT = 2.0
+"""Gradients of a corner's window, squared, relative to what the image's noise alone makes of them: below it, it may be
+noise that looks like a corner, and is found anywhere."""
+BLOCK_PX, SMOOTHEST = 8, 10
+"""Side of the blocks, and the per cent of the smoothest of them, by which an image's noise is measured."""
+SOBEL = 12.0
+"""Variance of OpenCV's gradient over 3 x 3 pixels for that of a pixel."""
+SECOND = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+"""What is left of an image by it is noise, but for edges; 6 times a pixel's."""
+LEAST_NOISE = 0.29
+"""Grey levels, standard deviation of what rounding does."""
 TEXTURE = 1e-4
 """Least eigenvalue of a window's gradients, divided by its pixels, below which a corner is not followed."""
 HYPOTHESES = 200
@@ -90,7 +101,8 @@ def corners(
     pixel = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
     surface, z = surface_depth(depth, pixel)
     pixel, z = pixel[surface], z[surface]
-    axes = _axes(grey, pixel)
+    axes, distinct = _axes(grey, pixel)
+    pixel, z, axes = pixel[distinct], z[distinct], axes[distinct]
     x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
     p_cam = np.stack([x * z, y * z, z], 1).astype(np.float32)
     every = _stride(camera)
@@ -122,8 +134,11 @@ def _filled(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.asarray(cv2.medianBlur(depth_of[nearest], MEDIAN_PX), np.float32)
 
 
-def _axes(grey: UInt8[np.ndarray, "H W"], pixel: Float32[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2 2"]:
-    """Of the structure tensor of the window around each corner, divided by its larger eigenvalue: its root.
+def _axes(
+    grey: UInt8[np.ndarray, "H W"], pixel: Float32[np.ndarray, "N 2"]
+) -> tuple[Float32[np.ndarray, "N 2 2"], Bool[np.ndarray, "N"]]:
+    """Of the structure tensor of the window around each corner, less what noise makes of it, divided by its larger
+    eigenvalue: its root. And whether the corner is more than noise.
 
     Pictures of one place differ by more than noise, by perspective and by light, and the more where they change more:
     what that moves a corner by is in proportion to the larger gradient over that along which it moves.
@@ -132,10 +147,21 @@ def _axes(grey: UInt8[np.ndarray, "H W"], pixel: Float32[np.ndarray, "N 2"]) -> 
     x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
     xx, xy, yy = (cv2.boxFilter(part, -1, (WINDOW_PX, WINDOW_PX))[v, u] for part in (x * x, x * y, y * y))
     tensor = np.stack([np.stack([xx, xy], 1), np.stack([xy, yy], 1)], 1)
+    by_noise = SOBEL * _noise(grey) ** 2
     strength, directions = np.linalg.eigh(tensor)
+    strength = np.maximum(strength - by_noise, 0)
     largest = np.maximum(strength[:, 1:], np.finfo(np.float32).tiny)
-    length = np.sqrt(np.maximum(strength, 0) / largest)
-    return (length[..., None] * directions.swapaxes(1, 2))[:, ::-1]
+    length = np.sqrt(strength / largest)
+    axes = (length[..., None] * directions.swapaxes(1, 2))[:, ::-1]
+    return axes.astype(np.float32), strength[:, 1] > DISTINCT * by_noise
+
+
+def _noise(grey: UInt8[np.ndarray, "H W"]) -> float:
+    """Standard deviation of the noise of a pixel, where the image is smoothest (Immerkær 1996)."""
+    second = np.abs(cv2.filter2D(grey, cv2.CV_32F, SECOND))
+    size = (grey.shape[1] // BLOCK_PX, grey.shape[0] // BLOCK_PX)
+    blocks = cv2.resize(second, size, interpolation=cv2.INTER_AREA)
+    return max(float(np.sqrt(np.pi / 2) / 6 * np.percentile(blocks, SMOOTHEST)), LEAST_NOISE)
 
 
 def follow(

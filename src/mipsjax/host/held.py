@@ -64,14 +64,6 @@ def directions(information: Matrix) -> Directions:
     return Directions(1 / np.sqrt(np.maximum(strength[::-1], least)), twists.T[::-1])
 
 
-def of_turns(information: Matrix) -> Matrix:
-    """What is left of an inverse covariance where nothing is said of shifts: of turns, whatever the shift is."""
-    shifts, both = information[:3, :3], information[:3, 3:]
-    out = np.zeros((6, 6))
-    out[3:, 3:] = information[3:, 3:] - both.T @ np.linalg.pinv(shifts, hermitian=True) @ both
-    return out
-
-
 def at(covariance: Matrix, T_sub_cam: Pose) -> Held:
     """Of a frame whose pose is known this well, and whose motion is not."""
     joint = np.zeros((12, 12))
@@ -79,14 +71,14 @@ def at(covariance: Matrix, T_sub_cam: Pose) -> Held:
     return Held(joint)
 
 
-def predicted(reference: Matrix, last: Held, T_sub_cam: Pose, seconds: float, cfg: HeldConfig) -> Held:
+def predicted(reference: Matrix | None, last: Held, T_sub_cam: Pose, seconds: float, cfg: HeldConfig) -> Held:
     """Before a frame is measured, about at `T_sub_cam`, `seconds` after the last one.
 
-    The camera goes on as it did, give or take an acceleration. Relative to what is off by `reference`: what is common
-    to both is counted once.
+    The camera goes on as it did, give or take an acceleration. Relative to what is off by `reference`, if anything:
+    what is common to both is counted once.
     """
     covariance, cross, motion = last.joint[:6, :6], last.joint[:6, 6:], last.joint[6:, 6:]
-    since = difference(covariance, reference)
+    since = covariance if reference is None else difference(covariance, reference)
     cross = _bounded(cross, since, motion)
     seconds = min(seconds, LONGEST)
     # White noise that does as much over a while as an acceleration that lasts
@@ -97,21 +89,45 @@ def predicted(reference: Matrix, last: Held, T_sub_cam: Pose, seconds: float, cf
     return Held(_positive(joint + np.tile(carried(np.diag(axes**2), T_sub_cam), (2, 2))))
 
 
-def held(reference: Matrix, expected: Held, T_sub_cam: Pose, information: Matrix) -> Held:
+def held(reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix) -> Held:
     """After a frame was tracked at `T_sub_cam`, of which this was `expected`: the update of a Kalman filter.
 
     It was measured with the `information` of a twist in the camera's frame, relative to keyframes that are themselves
-    off by `reference`. What is measured of a pose says as much of the motion that led there.
+    off by `reference`, or, where that is None, to the frame before. What is measured of a pose says as much of the
+    motion that led there.
     """
     values, vectors = np.linalg.eigh(expected.joint)
     root = vectors * np.sqrt(np.maximum(values, 0))
-    back = adjoint(np.linalg.inv(T_sub_cam)) @ root[:6]
+    back = adjoint(np.linalg.inv(T_sub_cam)) @ root[_measured(reference)]
     # P - P (P + R)^-1 P, in a form that stays a covariance whatever is rounded
     strength, axes = np.linalg.eigh(_even(back.T @ information @ back))
     root = root @ axes
     joint = (root / (1 + np.maximum(strength, 0))) @ root.T
-    joint[:6, :6] += reference
+    if reference is not None:
+        joint[:6, :6] += reference
     return Held(_even(joint))
+
+
+def _measured(reference: Matrix | None) -> slice:
+    """Part of a joint covariance: against the frame before, a frame's motion is measured and not its pose."""
+    return slice(6, 12) if reference is None else slice(0, 6)
+
+
+class Gains(NamedTuple):
+    """What share of a surprise is believed, of a twist in the camera's frame from where it was expected to where it was
+    measured."""
+
+    pose: Matrix
+    motion: Matrix
+    """Of the motion since the frame before, which the next one goes on with."""
+
+
+def gains(reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix) -> Gains:
+    """Of a frame that is measured at about `T_sub_cam`, as for `held` (Kalman 1960)."""
+    into, measured = adjoint(np.linalg.inv(T_sub_cam)), _measured(reference)
+    whole, motion = (into @ expected.joint[part, measured] @ into.T for part in (measured, slice(6, 12)))
+    believed = np.linalg.solve(np.eye(6) + information @ whole, information)
+    return Gains(whole @ believed, motion @ believed)
 
 
 def adjoint(T_a_b: Pose) -> Matrix:
