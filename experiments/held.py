@@ -1,6 +1,6 @@
 """What holds the camera, in scenes that nobody tuned on: one command for a whole table, on two cores at once.
 
-    python experiments/held.py [--groups large homes ...] [--seeds 0 1 2] [--workers 2] [--again]
+    python experiments/held.py [--groups large homes ...] [--seeds 0 1 2] [--only bookstore ...] [--again]
     python experiments/held.py --page
 
 Each run is a process held to one core, two at a time. Writes `docs/held.csv`, a row a run, as each of them ends, and
@@ -450,6 +450,7 @@ def main() -> None:
     )
     parser.add_argument("--groups", nargs="*", choices=GROUPS, default=[g for g in GROUPS if g != "tuning"])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
+    parser.add_argument("--only", nargs="*", default=[""], help="parts of names; other sequences are left out")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="also what there is a row of already")
     parser.add_argument("--page", action="store_true")
@@ -462,7 +463,8 @@ def main() -> None:
         os.sched_setaffinity(0, {options.core})
         print(json.dumps(done(Task(*json.loads(options.one)))))
     else:
-        wanted = [task for group in options.groups for task in tasks(group, options.seeds)]
+        every = [task for group in options.groups for task in tasks(group, options.seeds)]
+        wanted = [task for task in every if any(part in task.name for part in options.only)]
         all_of(wanted, options.workers, options.again)
 
 
