@@ -450,7 +450,9 @@ def main() -> None:
     )
     parser.add_argument("--groups", nargs="*", choices=GROUPS, default=[g for g in GROUPS if g != "tuning"])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
-    parser.add_argument("--only", nargs="*", default=[""], help="parts of names; other sequences are left out")
+    parser.add_argument(
+        "--only", nargs="*", default=[""], help="parts of names; other sequences are left out"
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="also what there is a row of already")
     parser.add_argument("--page", action="store_true")
