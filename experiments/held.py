@@ -5,7 +5,7 @@
 
 Each run is a process held to one core, two at a time. Writes `docs/held.csv`, a row a run, as each of them ends, and
 for each a plan, `held-NAME.png` in `experiments/out`: the true and the estimated path from above. The whole table takes
-hours: runs of which there is a row of the same code, the state of `src/` in git, are left out unless `--again`.
+hours: runs of which there is a row of the same code, by a digest of `src/`, are left out unless `--again`.
 `--page` writes `docs/held.md` from the CSV.
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
@@ -25,6 +25,8 @@ aligned.
 from __future__ import annotations
 
 import argparse
+import ast
+import hashlib
 import json
 import os
 import subprocess
@@ -66,7 +68,6 @@ OFF_M = 0.3
 FLAT = 128
 """Grey of an image that shows nothing."""
 RESULTS = ROOT / "docs"
-UNKNOWN = "+"
 TEST_HOMES, TUNING_HOMES = range(1, 11), range(101, 111)
 
 
@@ -149,6 +150,7 @@ def along_the_ray(sequence: Sequence, place: int) -> Frame:
 
 
 def in_whole_metres(sequence: Sequence, place: int) -> Frame:
+    """With depth as of an image whose unit was taken for a thousand times what it is."""
     frame = sequence[place]
     return frame if frame.depth is None else frame._replace(depth=np.round(frame.depth))
 
@@ -174,7 +176,7 @@ def done(task: Task) -> dict[str, Any]:
         return seen if altered is None else Altered(seen, altered)
 
     found = run(path, cfg, frames=frames, seed=task.seed, see=see)
-    row = task._asdict() | found.row | {"sequence": task.name.removeprefix("synth:")}
+    row = task._asdict() | found.row | {"sequence": _short(task.name)}
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share
     row["contradicted"] = agreement is not None and agreement.begins is not None
@@ -315,15 +317,14 @@ def in_a_process(task: Task, core: int) -> dict[str, Any]:
     command = [sys.executable, __file__, "--one", json.dumps(task), "--core", str(core)]
     ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if ended.returncode:
-        return task._asdict() | {"sequence": task.name, "failed": f"exit code {ended.returncode}"}
+        return task._asdict() | {"sequence": _short(task.name), "failed": f"exit code {ended.returncode}"}
     return json.loads(ended.stdout.splitlines()[-1])
 
 
 def all_of(wanted: list[Task], workers: int, again: bool) -> None:
     """All runs, as many at a time as there are workers, each on a core of its own; replaces rows of the same runs."""
     rows, now = {_key(row): row for row in read_rows("held", RESULTS)}, code()
-    same = {key for key, row in rows.items() if row.get("code") == now and not row.get("failed")}
-    known = set() if now.endswith(UNKNOWN) else same
+    known = {key for key, row in rows.items() if row.get("code") == now and not row.get("failed")}
     wanted = [task for task in wanted if again or _key(task._asdict()) not in known]
     cores: SimpleQueue[int] = SimpleQueue()
     for core in sorted(os.sched_getaffinity(0))[:workers]:
@@ -344,14 +345,28 @@ def all_of(wanted: list[Task], workers: int, again: bool) -> None:
             write_rows("held", rows.values(), RESULTS)
 
 
-def code() -> str:
-    """The state of `src/`, by which runs can be told apart; with `UNKNOWN` at its end where it is not committed."""
+def code(source: Path = ROOT / "src") -> str:
+    """What tells programs apart: a digest of all of `src/` without its comments and docstrings."""
+    digest = hashlib.sha256()
+    for path in sorted(source.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                node.body = [line for line in node.body if not _is_text(line)] or [ast.Pass()]
+        digest.update(f"{path.relative_to(source)} {ast.dump(tree)}".encode())
+    return digest.hexdigest()[:8]
 
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(ROOT), *arguments]
-        return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
-    return git("rev-parse", "--short", "HEAD:src") + (UNKNOWN if git("status", "--porcelain", "src") else "")
+def _is_text(line: ast.stmt) -> bool:
+    return (
+        isinstance(line, ast.Expr)
+        and isinstance(line.value, ast.Constant)
+        and isinstance(line.value.value, str)
+    )
+
+
+def _short(name: str) -> str:
+    return name.removeprefix("synth:")
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -391,34 +406,40 @@ PAGE = """# Held everywhere
 
 What holds the camera on sequences that nobody tuned on. Made by `python experiments/held.py --page` from `held.csv`
 beside it, which `python experiments/held.py` writes; what the columns mean is in its docstring. Default preset, each
-run held to one core; `code` is the state of `src/` in git, `git rev-parse --short COMMIT:src`.
+run held to one core; `code` is a digest of the program, by which rows of one can be told from those of another.
 """
 
 
 def in_sum(rows: list[dict[str, str]]) -> str:
-    """What the runs of a group say together, one line for each kind of sequence and switch."""
-
-    def column(key: str) -> np.ndarray:
-        values = np.array([float(row.get(key) or "nan") for row in chosen])
-        return values[np.isfinite(values)]
-
+    """What the runs of a group say together, a line for each kind of sequence and switch."""
     lines = []
     for kind in dict.fromkeys(map(_kind, rows)):
-        chosen = [row for row in rows if _kind(row) == kind]
-        ate, true = column("ate_cm"), int(column("loops_true").sum())
-        words = [f"{len(chosen)} runs", f"ATE {ate.mean():.2f} cm in the mean and {ate.max():.2f} at most"]
-        words.append(
-            f"{int(column('lost').sum())} frames lost, {int(column('wrong_ok').sum())} `ok` and far off"
-        )
-        found, false = (int(column(f"loops_{key}").sum()) for key in ("found", "false"))
-        words.append(f"{found} of {true} true loops found, {false} false kept")
-        near, elsewhere = column("near_change_mm"), column("elsewhere_mm")
-        if len(near):
-            words.append(
-                f"near a change of submap {near.mean() / elsewhere.mean():.2f} times as far off as elsewhere"
-            )
+        words = _of_kind([row for row in rows if _kind(row) == kind])
         lines.append(f"- {kind}: " + "; ".join(words))
     return "\n".join(lines) + "\n"
+
+
+def _of_kind(rows: list[dict[str, str]]) -> list[str]:
+    def column(key: str) -> np.ndarray:
+        values = np.array([float(row.get(key) or "nan") for row in rows])
+        return values[np.isfinite(values)]
+
+    def total(key: str) -> int:
+        return int(column(key).sum())
+
+    words, ate = [f"{len(rows)} run" + "s" * (len(rows) > 1)], column("ate_cm")
+    if failed := sum(bool(row.get("failed")) for row in rows):
+        words.append(f"{failed} failed")
+    if len(ate):
+        words.append(f"ATE {ate.mean():.2f} cm in the mean and {ate.max():.2f} at most")
+        words.append(f"{total('lost')} frames lost, {total('wrong_ok')} `ok` and far off")
+        words.append(f"{total('loops_found')} of {total('loops_true')} true loops found")
+        words.append(f"{total('loops_false')} false kept")
+    near, elsewhere = column("near_change_mm"), column("elsewhere_mm")
+    if len(near):
+        ratio = near.mean() / elsewhere.mean()
+        words.append(f"near a change of submap {ratio:.2f} times as far off as elsewhere")
+    return words
 
 
 def _kind(row: Mapping[str, str]) -> str:
@@ -426,6 +447,7 @@ def _kind(row: Mapping[str, str]) -> str:
     name = row["sequence"]
     if name.startswith("home-"):
         name = "fast homes" if "-fast" in name else "slow homes"
+    name += f", every {row['stride']}th frame" if row["stride"] != "1" else ""
     return name if row["switch"] == "full" else f"{name}, {row['switch']}"
 
 
@@ -451,7 +473,7 @@ def main() -> None:
     parser.add_argument("--groups", nargs="*", choices=GROUPS, default=[g for g in GROUPS if g != "tuning"])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument(
-        "--only", nargs="*", default=[""], help="parts of names; other sequences are left out"
+        "--only", nargs="*", default=[""], help="parts of names, which every name has one of if none is given"
     )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="also what there is a row of already")

@@ -25,13 +25,13 @@ def verdict(sequence: Sequence, T_world_cam: np.ndarray) -> Agreement | None:
     """By as many frames as a run is judged by, with places among them made places in the sequence."""
     places = np.arange(len(sequence))[:: max(1, -(-len(sequence) // MOST_VIEWS))]
     every = thumbnail_stride(sequence.intrinsics)
-    depth = [sequence[place].cleaned().depth for place in places]
-    assert all(image is not None for image in depth), "every frame needs depth"
-    views = Views(
-        np.stack([image[::every, ::every] for image in depth if image is not None]),
-        T_world_cam[places],
-        sequence.intrinsics.decimated(every),
-    )
+    depth = []
+    for place in places:
+        image = sequence[place].cleaned().depth
+        if image is None:
+            raise SystemExit(f"frame {place} has no depth, which every frame needs here")
+        depth.append(image[::every, ::every])
+    views = Views(np.stack(depth), T_world_cam[places], sequence.intrinsics.decimated(every))
     sensor = SensorConfig()
     found = agreement(views, Noise(sensor.noise_floor, sensor.noise_growth))
     if found is None or found.begins is None:
@@ -50,7 +50,8 @@ def main() -> None:
     sequence = open_sequence(options.sequence)
     for path in options.trajectory:
         poses = read_trajectory(path).poses
-        assert len(poses) == len(sequence), f"{path} has {len(poses)} poses and not {len(sequence)}"
+        if len(poses) != len(sequence):
+            raise SystemExit(f"{path} has {len(poses)} poses and the sequence {len(sequence)} frames")
         found = verdict(sequence, poses)
         if found is None:
             print(f"{path}: too few frames see the same")

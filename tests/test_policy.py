@@ -24,7 +24,7 @@ PLAIN = FrameStats(
     known=0.9,
     confirmed=0.8,
     open=0.002,
-    off=0.01,
+    astray=0.01,
     residual=0.01,
     least_residual=0.008,
     unsure=False,
@@ -135,10 +135,10 @@ def test_a_weak_frame_is_mapped():
 @pytest.mark.parametrize(
     ("change", "status", "trouble"),
     [
-        ({"open": 0.029, "off": 0.09}, Status.OK, False),
+        ({"open": 0.029, "astray": 0.09}, Status.OK, False),
         ({"open": 0.031}, Status.WEAK, True),
         # Held by what it sees, but since a slide nobody knows where: the next search need not be wider
-        ({"off": 0.11}, Status.WEAK, False),
+        ({"astray": 0.11}, Status.WEAK, False),
     ],
 )
 def test_a_frame_that_may_be_elsewhere_is_weak(change, status, trouble):

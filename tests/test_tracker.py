@@ -46,10 +46,13 @@ def test_a_camera_that_may_be_elsewhere_is_measured_against_the_frame_before():
         (sure, Status.OK, [], NONE),
         (unsure, Status.OK, [], None),
         (unsure, Status.OK, [seen], loose),
-        (unsure, Status.SKIPPED, [], NONE),
+        # What has passed since it was known taught the map nothing
+        (unsure, Status.SKIPPED, [], unsure.covariance),
     ):
-        record = state.records[-1]._replace(held=held, status=status)
-        there = _reference(state._replace(records=(record,)), keyframes, found, CFG)
+        known = state.records[-1]._replace(held=held)
+        records = (known, known._replace(status=status, held=at(np.eye(6), np.eye(4))))
+        records = records[:1] if status is Status.OK else records
+        there = _reference(state._replace(records=records), keyframes, found, CFG)
         assert (there is None) == (expected is None)
         np.testing.assert_array_equal(
             NONE if there is None else there, NONE if expected is None else expected

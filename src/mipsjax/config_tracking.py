@@ -152,7 +152,7 @@ class BrightnessConfig:
 
 @dataclass(frozen=True)
 class HeldConfig:
-    """What is said of how far a pose may be off."""
+    """How far a pose may be off, and what follows from that."""
 
     points: float = 4.0
     """Points of surfaces that err together, as neighbours on one surface do."""
@@ -165,13 +165,13 @@ class HeldConfig:
     turn: float = 6.0
     """rad/s^2, the same."""
     loose: float = 0.01
-    """Metres (or as many rad): along a direction that measurements leave open by this standard deviation, the motion
-    before says with them where the frame is."""
+    """Metres (or as many rad): along a direction that measurements leave open by more than this standard deviation, the
+    pose is a mean of what was measured and of where the motion before led, by how well each is known."""
     weak: float = 0.03
     """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation."""
     unsure: float = 0.1
-    """Metres: so is one where the camera may be this far off in its submap, standard deviation, after all that led
-    there; keyframes that seem near may then be elsewhere."""
+    """Metres: a frame is also weak where the camera may be this far off in its submap, standard deviation, after all
+    that led there; keyframes that seem near may then be elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -216,6 +216,7 @@ NOT_BELOW = (
     ("guard.residual", "guard.residual_unsure"),
     ("guard.residual_unsure", "guard.residual_lost"),
     ("correspond.max_gradient", "correspond.min_gradient"),
+    ("track.held.weak", "track.held.loose"),
 )
 """Pairs whose first field must not be below the second."""
 

@@ -15,8 +15,8 @@ class Status(StrEnum):
 
     OK = "ok"
     WEAK = "weak"
-    """Hardly held by what was measured, or since a frame that was not. Mapped, unless it has hardly any depth or was
-    only found again."""
+    """Little of it is known, or little holds it, or the camera may have gone astray before. It is mapped, unless it has
+    hardly any depth or was only found again."""
     LOST = "lost"
     """Not mapped; its pose is the last trusted one."""
     SKIPPED = "skipped"
@@ -35,7 +35,7 @@ class FrameStats(NamedTuple):
     """The same where the map is certain."""
     open: float
     """Standard deviation, metres or rad, along the direction that measurements hold least."""
-    off: float
+    astray: float
     """Metres, standard deviation of where the camera is in its submap, after all that led there."""
     residual: float
     """Metres."""
@@ -126,14 +126,14 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
-    unsure = stats.off > cfg.track.held.unsure
-    return Status.WEAK if _is_weak(stats, cfg) or unsure else Status.OK
+    astray = stats.astray > cfg.track.held.unsure
+    return Status.WEAK if _is_weak(stats, cfg) or astray else Status.OK
 
 
 def _is_weak(stats: FrameStats, cfg: Config) -> bool:
     """Whether this frame by itself is."""
-    loose = stats.open > cfg.track.held.weak
-    return stats.known < cfg.guard.weak or loose or _is_sparse(stats, cfg)
+    held = stats.open <= cfg.track.held.weak
+    return stats.known < cfg.guard.weak or not held or _is_sparse(stats, cfg)
 
 
 def _allowed(stats: FrameStats, cfg: Config) -> float:

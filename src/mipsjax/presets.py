@@ -61,7 +61,7 @@ PAPER = Config(
         ),
         corners=CornerConfig(count=0),
         brightness=BrightnessConfig(weight=0.0),
-        held=HeldConfig(weak=UNLIMITED),
+        held=HeldConfig(loose=UNLIMITED, weak=UNLIMITED, unsure=UNLIMITED),
     ),
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
@@ -88,7 +88,7 @@ TINY = Config(
     track=TrackConfig(
         ro=SearchConfig(particles=128, pixels=48, steps=4),
         go=RefineConfig(pixels=192, steps=8, smooth_pixels=192, smooth_steps=4),
-        held=HeldConfig(weak=UNLIMITED),
+        held=HeldConfig(loose=UNLIMITED, weak=UNLIMITED, unsure=UNLIMITED),
     ),
     guard=UNGUARDED,
     pairs=PairConfig(pixels=192),

@@ -227,7 +227,7 @@ def _stats(state: SlamState, depth: np.ndarray, tracked: Tracked) -> FrameStats:
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
         open=float(tracked.together.deviation[-1]),
-        off=deviations(tracked.held.covariance, T_sub_cam)[0],
+        astray=deviations(tracked.held.covariance, T_sub_cam)[0],
         residual=float(info.after.residual),
         least_residual=state.residual,
         unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),

@@ -17,7 +17,7 @@ from mipsjax.host.held import NONE, at, carried, difference
 from mipsjax.links import best_link, chain, joined, links
 from mipsjax.policy import NEW, STAY, governor
 from mipsjax.rest import awake, rested
-from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, rigid
+from mipsjax.state import Keyframe, Pose, SlamState, Submap, distance, inverse, pose_of, rigid
 
 AGAIN = 3  # times at most that registration is repeated: from 9 cm off the third moves a frame by millimetres
 VIEWS = 8  # keyframes that say what a submap observed around a guess
@@ -221,7 +221,8 @@ def _revisit(state: SlamState, place: int, cfg: Config) -> SlamState:
 def moved_in(state: SlamState, place: int, keyframe: int) -> SlamState:
     """The submap at `place` is active, and the last frame hangs on its own keyframe there."""
     own, last = state.submaps[place].keyframes[keyframe], state.records[-1]
-    held = at(own.covariance, own.T_sub_cam)
+    T_new_old = own.T_sub_cam @ inverse(pose_of(state, last))
+    held = at(own.covariance, own.T_sub_cam, carried(last.held.joint[6:, 6:], T_new_old))
     last = last._replace(submap=place, keyframe=keyframe, T_keyframe_cam=np.eye(4), held=held)
     return activated(state, place)._replace(records=(*state.records[:-1], last))
 

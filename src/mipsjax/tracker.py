@@ -115,12 +115,16 @@ def _reference(state: SlamState, near: list[Keyframe], found: list[Seen], cfg: C
     Where the camera may be farther off than `track.held.unsure`, a keyframe that seems near may be elsewhere, unless
     the frame shows its corners; then what the frame fits is what the map has learned of the one before, a moment ago.
     """
-    last = state.records[-1]
-    metres, _ = deviations_of(state, last)
-    if metres > cfg.track.held.unsure and last.status in TRUSTED:
-        seen = {one.reference.record for one in found}
-        near = [keyframe for keyframe in state.submap.keyframes if keyframe.number in seen]
-    return min((keyframe.covariance for keyframe in near), key=np.trace, default=None)
+    known = last_trusted(state)
+    metres, _ = deviations_of(state, known)
+    if metres <= cfg.track.held.unsure:
+        return min((keyframe.covariance for keyframe in near), key=np.trace)
+    seen = {one.reference.record for one in found}
+    shown = [keyframe.covariance for keyframe in state.submap.keyframes if keyframe.number in seen]
+    if shown:
+        return min(shown, key=np.trace)
+    # After a gap nothing was learned since the last frame that is known
+    return None if known is state.records[-1] else known.held.covariance
 
 
 def _information(info: tracking.TrackInfo, cfg: Config) -> tuple[Matrix, Matrix]:
@@ -138,19 +142,19 @@ def _believed(
     T_found: Pose, T_as_before: Pose, together: Directions, gain: Gains, cfg: Config
 ) -> tuple[Pose, Pose]:
     """Where the frame is, and where its motion led: as found, but along directions that measurements leave loose, where
-    the motion before says as much as it is known better."""
+    both are means of what was found and of where the motion before led, by the gain."""
     motion = np.linalg.inv(T_as_before) @ T_found
     # To first order a twist: what is left loose is a shift, or a small turn
-    off = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
+    surprise = np.concatenate([motion[:3, 3], Rotation.from_matrix(motion[:3, :3]).as_rotvec()])
     loose = together.twist[together.deviation > cfg.track.held.loose]
-    if not len(loose):
-        return T_found, T_found
-    poses = []
-    for share in gain:
-        twist, change = loose.T @ (loose @ (share @ off - off)), np.eye(4)
-        change[:3, :3], change[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
-        poses.append(T_found @ change)
-    return poses[0], poses[1]
+
+    def moved(share):
+        twist, change = loose.T @ (loose @ (share @ surprise - surprise)), np.eye(4)
+        change[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix()
+        change[:3, 3] = twist[:3]
+        return T_found @ change
+
+    return (moved(gain.pose), moved(gain.motion)) if len(loose) else (T_found, T_found)
 
 
 def _near(state: SlamState, cfg: Config) -> list[Keyframe]:

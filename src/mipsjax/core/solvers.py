@@ -191,7 +191,8 @@ def steady_hessian(parts: list[Rows], points: Points, normals: Float[Array, "P 3
 
     Normals are noisy, and surfaces that were learned have bumps: along a bare wall both seem to hold a frame that
     slides freely. Surfaces and the frame's own `normals` do not know of each other's noise, so that the Hessian of
-    both has the right mean. Along the directions in which that is weakest only that counts, less its own noise.
+    both has the right mean, of points that lie on a plane of the frame. Along the directions in which that is weakest
+    only that counts, less its own noise.
     """
     hessian = sum(part.system().hessian for part in parts)
     own = by_twist(points.p_cam, normals)
@@ -199,6 +200,7 @@ def steady_hessian(parts: list[Rows], points: Points, normals: Float[Array, "P 3
     each = [(part.weight[..., None] * part.jacobian).reshape(-1, *own.shape) for part in parts]
     weighted = jnp.sum(jnp.concatenate(each), 0)
     agreed = weighted.T @ own
+    # Not those of the Hessian: by noise they lean towards what is held, which is a hundred times as firm
     strength, directions = jnp.linalg.eigh((agreed + agreed.T) / 2)
     weakest = directions[:, :DOUBTED]
     noise = jnp.linalg.norm((weighted @ weakest) * (own @ weakest), axis=0)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mipsjax.core.camera import Intrinsics, project, rays
 
 STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
-STEADY = 64  # the same, as a part of the image's width, where it matters more that a normal has little noise
+STEADY = 64  # so many such steps make the image's width, where it matters more that a normal has little noise
 JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
 BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
 NOISE = 2.0  # deviations of the depth by which that may be more: in the noise of 3 m no plane is that even

@@ -35,16 +35,15 @@ ROUGHLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
 EXACTLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
 """When it ends in the second round, after so many steps or a step of so many pixels."""
 DISTINCT = 2.0
-"""Gradients of a corner's window, squared, relative to what the image's noise alone makes of them: below it, it may be
-noise that looks like a corner, and is found anywhere."""
-BLOCK_PX, SMOOTHEST = 8, 10
-"""Side of the blocks, and the per cent of the smoothest of them, by which an image's noise is measured."""
-SOBEL = 12.0
-"""Variance of OpenCV's gradient over 3 x 3 pixels for that of a pixel."""
-SECOND = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
-"""What is left of an image by it is noise, but for edges; 6 times a pixel's."""
-LEAST_NOISE = 0.29
-"""Grey levels, standard deviation of what rounding does."""
+"""Times the squared gradients that noise makes, by which those around a corner are more than noise makes: with less it
+may be noise that looks like a corner, and is found anywhere."""
+SMOOTHEST = 10
+"""Per cent of the image, its smoothest part, by which that noise is measured."""
+EVERY_PX = 8
+"""Pixels between the places at which that is looked for."""
+LEAST_NOISE, MOST_NOISE = 1.0, 400.0
+"""Squared gradients, of OpenCV's Sobel filter, that rounding makes, and white noise of 6 grey levels: what is smoothest
+in an image that is textured all over is none of noise."""
 TEXTURE = 1e-4
 """Least eigenvalue of a window's gradients, divided by its pixels, below which a corner is not followed."""
 HYPOTHESES = 200
@@ -147,7 +146,7 @@ def _axes(
     x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
     xx, xy, yy = (cv2.boxFilter(part, -1, (WINDOW_PX, WINDOW_PX))[v, u] for part in (x * x, x * y, y * y))
     tensor = np.stack([np.stack([xx, xy], 1), np.stack([xy, yy], 1)], 1)
-    by_noise = SOBEL * _noise(grey) ** 2
+    by_noise = _of_noise(x, y)
     strength, directions = np.linalg.eigh(tensor)
     strength = np.maximum(strength - by_noise, 0)
     largest = np.maximum(strength[:, 1:], np.finfo(np.float32).tiny)
@@ -156,12 +155,14 @@ def _axes(
     return axes.astype(np.float32), strength[:, 1] > DISTINCT * by_noise
 
 
-def _noise(grey: UInt8[np.ndarray, "H W"]) -> float:
-    """Standard deviation of the noise of a pixel, where the image is smoothest (Immerkær 1996)."""
-    second = np.abs(cv2.filter2D(grey, cv2.CV_32F, SECOND))
-    size = (grey.shape[1] // BLOCK_PX, grey.shape[0] // BLOCK_PX)
-    blocks = cv2.resize(second, size, interpolation=cv2.INTER_AREA)
-    return max(float(np.sqrt(np.pi / 2) / 6 * np.percentile(blocks, SMOOTHEST)), LEAST_NOISE)
+def _of_noise(x: Float32[np.ndarray, "H W"], y: Float32[np.ndarray, "H W"]) -> float:
+    """The squared gradient along one axis where the image is smoothest: whatever made its noise, and smoothed it. Parts
+    without any, as where it is too dark or too bright, say nothing."""
+    squared = cv2.boxFilter((x * x + y * y) / 2, -1, (WINDOW_PX, WINDOW_PX))[::EVERY_PX, ::EVERY_PX]
+    squared = squared[squared > 0]
+    if not squared.size:
+        return LEAST_NOISE
+    return float(np.clip(np.percentile(squared, SMOOTHEST), LEAST_NOISE, MOST_NOISE))
 
 
 def follow(

@@ -64,10 +64,11 @@ def directions(information: Matrix) -> Directions:
     return Directions(1 / np.sqrt(np.maximum(strength[::-1], least)), twists.T[::-1])
 
 
-def at(covariance: Matrix, T_sub_cam: Pose) -> Held:
-    """Of a frame whose pose is known this well, and whose motion is not."""
+def at(covariance: Matrix, T_sub_cam: Pose, motion: Matrix | None = None) -> Held:
+    """Of a frame whose pose is known this well, and its motion this well; not at all if None."""
     joint = np.zeros((12, 12))
-    joint[:6, :6], joint[6:, 6:] = covariance, carried(MOVING**2 * np.eye(6), T_sub_cam)
+    joint[:6, :6] = covariance
+    joint[6:, 6:] = carried(MOVING**2 * np.eye(6), T_sub_cam) if motion is None else motion
     return Held(joint)
 
 
@@ -89,33 +90,9 @@ def predicted(reference: Matrix | None, last: Held, T_sub_cam: Pose, seconds: fl
     return Held(_positive(joint + np.tile(carried(np.diag(axes**2), T_sub_cam), (2, 2))))
 
 
-def held(reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix) -> Held:
-    """After a frame was tracked at `T_sub_cam`, of which this was `expected`: the update of a Kalman filter.
-
-    It was measured with the `information` of a twist in the camera's frame, relative to keyframes that are themselves
-    off by `reference`, or, where that is None, to the frame before. What is measured of a pose says as much of the
-    motion that led there.
-    """
-    values, vectors = np.linalg.eigh(expected.joint)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    back = adjoint(np.linalg.inv(T_sub_cam)) @ root[_measured(reference)]
-    # P - P (P + R)^-1 P, in a form that stays a covariance whatever is rounded
-    strength, axes = np.linalg.eigh(_even(back.T @ information @ back))
-    root = root @ axes
-    joint = (root / (1 + np.maximum(strength, 0))) @ root.T
-    if reference is not None:
-        joint[:6, :6] += reference
-    return Held(_even(joint))
-
-
-def _measured(reference: Matrix | None) -> slice:
-    """Part of a joint covariance: against the frame before, a frame's motion is measured and not its pose."""
-    return slice(6, 12) if reference is None else slice(0, 6)
-
-
 class Gains(NamedTuple):
-    """What share of a surprise is believed, of a twist in the camera's frame from where it was expected to where it was
-    measured."""
+    """What share of a surprise is believed: of a twist in the camera's frame, from where a frame was expected to where
+    it was measured."""
 
     pose: Matrix
     motion: Matrix
@@ -123,11 +100,47 @@ class Gains(NamedTuple):
 
 
 def gains(reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix) -> Gains:
-    """Of a frame that is measured at about `T_sub_cam`, as for `held` (Kalman 1960)."""
-    into, measured = adjoint(np.linalg.inv(T_sub_cam)), _measured(reference)
-    whole, motion = (into @ expected.joint[part, measured] @ into.T for part in (measured, slice(6, 12)))
-    believed = np.linalg.solve(np.eye(6) + information @ whole, information)
-    return Gains(whole @ believed, motion @ believed)
+    """Of a frame that is measured at about `T_sub_cam`, as for `held`."""
+    into, out = adjoint(np.linalg.inv(T_sub_cam)), adjoint(T_sub_cam)
+    weight, information = _weighed(reference, expected, T_sub_cam, information)
+    gain = weight @ information
+    return Gains(into @ gain[:6] @ out, into @ gain[6:] @ out)
+
+
+def held(reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix) -> Held:
+    """After a frame was tracked at `T_sub_cam`, of which this was `expected`: the update of a Kalman filter (Kalman
+    1960) in the form of Joseph, which stays a covariance whatever is rounded.
+
+    It was measured with the `information` of a twist in the camera's frame, relative to keyframes that are themselves
+    off by `reference`. What is measured of a pose says as much of the motion that led there. Where `reference` is None,
+    it was measured against the frame before, that is, its motion was. What that says of earlier motions moves no pose:
+    the map was learned there.
+    """
+    weight, information = _weighed(reference, expected, T_sub_cam, information)
+    left = np.eye(12)
+    left[:, _measured(reference)] -= weight @ information
+    joint = left @ expected.joint @ left.T + weight @ information @ weight.T
+    if reference is not None:
+        joint[:6, :6] += reference
+    return Held(_even(joint))
+
+
+def _weighed(
+    reference: Matrix | None, expected: Held, T_sub_cam: Pose, information: Matrix
+) -> tuple[Float64[np.ndarray, "12 6"], Matrix]:
+    """The gain of pose and motion is the first times the second, which is the information in the frame of the joint
+    covariance."""
+    into = adjoint(np.linalg.inv(T_sub_cam))
+    information = into.T @ _positive(information) @ into
+    measured = _measured(reference)
+    whole = expected.joint[measured, measured]
+    both = np.concatenate([whole, expected.joint[6:, measured]])
+    return np.linalg.solve((np.eye(6) + information @ whole).T, both.T).T, information
+
+
+def _measured(reference: Matrix | None) -> slice:
+    """Part of a joint covariance: against the frame before, a frame's motion is measured and not its pose."""
+    return slice(6, 12) if reference is None else slice(0, 6)
 
 
 def adjoint(T_a_b: Pose) -> Matrix:
