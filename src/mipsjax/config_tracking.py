@@ -23,7 +23,7 @@ class SearchConfig:
     translation: float = 0.25
     """Metres, first radius of the swarm."""
     widening: float = 1.5
-    """Factor on both radii for each weak or lost frame just before."""
+    """Factor on both radii for each frame just before that was lost or hardly held or known."""
     widening_limit: float = 3.0
     """Largest such factor."""
     momentum: float = 0.1

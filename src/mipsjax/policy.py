@@ -107,7 +107,7 @@ def governor(active: float, others: Mapping[int, float], fresh: float, cfg: Conf
 
 
 def widening(trouble: int, cfg: Config) -> float:
-    """Factor on the radii of the search after `trouble` weak or lost frames in a row."""
+    """Factor on the radii of the search after `trouble` frames in a row that were lost or hardly held or known."""
     factor, limit = cfg.track.ro.widening, cfg.track.ro.widening_limit
     # By logarithms: the power itself would overflow over a long blind stretch.
     return limit if trouble * log(factor) >= log(limit) else factor**trouble

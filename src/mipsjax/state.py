@@ -161,7 +161,7 @@ class SlamState(NamedTuple):
     records: tuple[Record, ...]
     camera: Intrinsics
     trouble: int
-    """Weak or lost frames in a row, up to now."""
+    """Frames in a row, up to now, that were lost or hardly held or known."""
     loops: tuple[Loop, ...] = ()
     motion: Motion | None = None
     """None before there are two trusted frames, and where a lost camera was found elsewhere."""

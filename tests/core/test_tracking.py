@@ -297,6 +297,36 @@ def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
     assert np.linalg.eigvalsh(surfaces + corners)[0] > 10 * np.linalg.eigvalsh(normals)[0]
 
 
+@pytest.mark.parametrize("roof", [False, True])
+def test_bumps_that_were_learned_hold_nothing_and_what_is_there_does(roof):
+    """A wall 2 m away, and one with a ridge from floor to ceiling, which holds a camera to either side. Views of it
+    have bumps of 5 mm, as a map that was learned from noise."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    x, y = 2 * (u - CAMERA.cx) / CAMERA.fx, 2 * (v - CAMERA.cy) / CAMERA.fy
+    exact = 2 - 0.3 * roof * np.maximum(0, 1 - np.abs(x) / 0.4)
+    bumps = 0.005 * np.sin(2 * np.pi * x / 0.25) * np.sin(2 * np.pi * y / 0.25)
+    noisy = exact + 0.004 * np.random.default_rng(0).standard_normal(exact.shape)
+
+    def hessian(frame, map_, own):
+        depth, views = jnp.asarray(frame, jnp.float32), jnp.asarray(map_, jnp.float32)[None]
+        points = tracking.draw_points(KEY, depth, np.zeros((*exact.shape, 3), np.uint8), 2304, CAMERA)
+        rows = solvers.view_rows(jnp.eye(4), points, Views(views, jnp.eye(4)[None]), CAMERA, PLANE_CFG)
+        if not own:
+            return np.asarray(rows.system().hessian)
+        normals = own_normals(depth, points.p_cam, CAMERA, PLANE_CFG.sensor.noise_growth)
+        return np.asarray(solvers.steady_hessian([rows], points, normals))
+
+    true, as_it_is, steady = (
+        hessian(exact, exact, False),
+        hessian(noisy, exact + bumps, False),
+        hessian(noisy, exact + bumps, True),
+    )
+    # Across the wall, and up and down it
+    assert as_it_is[1, 1] > 20 * max(steady[1, 1], true[1, 1])
+    np.testing.assert_allclose(steady[0, 0], true[0, 0], rtol=0.3, atol=0.02 * as_it_is[0, 0])
+    np.testing.assert_allclose(steady[2, 2], true[2, 2], rtol=0.2)
+
+
 def test_steps_end_where_they_are_short():
     """Each takes a fifth of the way to a pose: it ends a few steps of that length before it, and not at it."""
 
