@@ -406,7 +406,8 @@ PAGE = """# Held everywhere
 
 What holds the camera on sequences that nobody tuned on. Made by `python experiments/held.py --page` from `held.csv`
 beside it, which `python experiments/held.py` writes; what the columns mean is in its docstring. Default preset, each
-run held to one core; `code` is a digest of the program, by which rows of one can be told from those of another.
+run held to one core; `code` is a digest of the program. This page was made by {code}: rows of others are of earlier
+programs.
 """
 
 
@@ -453,7 +454,7 @@ def _kind(row: Mapping[str, str]) -> str:
 
 def write_page() -> Path:
     rows = read_rows("held", RESULTS)
-    parts = [PAGE]
+    parts = [PAGE.format(code=code())]
     for group in dict.fromkeys(row["group"] for row in rows):
         chosen = [row for row in rows if row["group"] == group]
         shown = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in chosen)}
