@@ -178,9 +178,13 @@ def read_rows(name: str, folder: Path = OUT) -> list[dict[str, str]]:
 
 def print_table(name: str) -> None:
     """The rows of a CSV as a table of Markdown."""
-    rows = read_rows(name)
+    print(table(read_rows(name)))
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """Of Markdown; the columns are those of the first row."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-    print("\n".join("| " + " | ".join(cells) + " |" for cells in lines))
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def show(row: Mapping[str, Any]) -> None:

@@ -4,9 +4,10 @@
     python experiments/held.py --page
 
 Each run is a process held to one core, two at a time. Writes `docs/held.csv`, a row a run, as each of them ends, and
-for each a plan, `held-NAME.png` in `experiments/out`: the true and the estimated path from above. The whole table takes
-hours: runs of which there is a row of the same code, by a digest of `src/`, are left out unless `--again`.
-`--page` writes `docs/held.md` from the CSV.
+in `experiments/out`, where the truth is known, the poses, the mesh and a plan of each: the true and the estimated path
+from above. The whole table takes hours: runs of which there is a row of the same code, by a digest of `src/`, are left
+out unless `--again`. `--page` writes `docs/held.md` and the table of the README from the CSV, and `docs/held.png` where
+the runs that it shows were made here.
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
 and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
@@ -41,9 +42,10 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
+from matplotlib.axes import Axes
 from scipy.spatial import KDTree
 
-from common import DATA, OUT, ROOT, Altered, Run, changed, read_rows, run, show, write_rows
+from common import DATA, OUT, ROOT, Altered, Run, changed, read_rows, run, show, table, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.sequence import Frame, Sequence
@@ -69,6 +71,17 @@ FLAT = 128
 """Grey of an image that shows nothing."""
 RESULTS = ROOT / "docs"
 TEST_HOMES, TUNING_HOMES = range(1, 11), range(101, 111)
+MARKS = "<!-- held.py --page -->", "<!-- end -->"
+"""What the README has its table between."""
+FIGURES = "rooms", "kitchen", "large", "homes", "loops"
+"""Groups that the README shows."""
+PLANS = (
+    "bookstore-1-full-0",
+    "home-2-fast+noise+blur-1-full-0",
+    "home-4-fast+noise+blur-1-full-0",
+    "home-6-fast+noise+blur-1-full-0",
+)
+"""Runs of which plans are shown together."""
 
 
 class Task(NamedTuple):
@@ -183,18 +196,46 @@ def done(task: Task) -> dict[str, Any]:
     true = found.sequence.T_world_cam
     if true is not None and np.isfinite(true).all():
         row |= slides(found) | wrong(found) | stated(found.state, found) | near_changes(found)
-        row |= loops(found.state, found, cfg) | surface(found.state, Path(path) / "observed.npz", cfg)
-        plan(found, OUT / f"held-{row['sequence'].replace('/', '-')}-{task.switch}-{task.seed}.png")
+        mesh = reconstruct(found.state, cfg)
+        row |= loops(found.state, found, cfg) | surface(mesh, Path(path) / "observed.npz")
+        name = "-".join(map(str, ("held", row["sequence"].replace("/", "-"), *task[2:])))
+        keep(found, mesh, name)
     return row
 
 
-def surface(state: SlamState, observed: Path, cfg: Config) -> dict[str, Any]:
+def keep(found: Run, mesh: trimesh.Trimesh, name: str) -> None:
+    """Poses, status and submap of each frame, the mesh, and a plan."""
+    OUT.mkdir(exist_ok=True)
+    mesh.export(OUT / f"{name}.ply")
+    records, poses, true = found.state.records, trajectory(found.state), found.sequence.T_world_cam
+    status = [record.status.value for record in records]
+    submap = [record.submap for record in records]
+    np.savez_compressed(OUT / f"{name}.npz", poses=poses, true=true, status=status, submap=submap)
+    figure, axes = plt.subplots(figsize=(6, 6))
+    plan(axes, poses, true)
+    axes.legend()
+    figure.savefig(OUT / f"{name}.png", dpi=100, bbox_inches="tight")
+    plt.close(figure)
+
+
+def plan(axes: Axes, poses: np.ndarray, true: np.ndarray) -> None:
+    """True and estimated path from above, the latter aligned to the former, in metres."""
+    T = align_rigid(poses[:, :3, 3], true[:, :3, 3])
+    aligned = (T @ poses)[:, :3, 3]
+    spread = np.ptp(true[:, :3, 3], axis=0)
+    x, y = np.sort(np.argsort(spread)[1:])  # the two directions in which the camera moves most
+    axes.plot(true[:, x, 3], true[:, y, 3], color="0.6", linewidth=3, label="true")
+    axes.plot(aligned[:, x], aligned[:, y], color="C3", linewidth=1, label="estimated")
+    axes.set_aspect("equal")
+    axes.set_xlabel("metres")
+
+
+def surface(mesh: trimesh.Trimesh, observed: Path) -> dict[str, Any]:
     """How well the mesh shows the surface that was seen, where a recording has a file of it."""
     if not observed.exists():
         return {}
     with np.load(observed) as file:
         true = file["q"].T * file["step"] + file["origin"]
-    mesh = reconstruct(state, cfg)
     if mesh.is_empty:
         return {"completion": 0.0}
     sampled, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
@@ -292,24 +333,6 @@ def _rightly(state: SlamState, j: int, k: int, true: np.ndarray) -> bool:
             anchor = state.submaps[place].keyframes[0].number
             off.append(distance(inverse(true[anchor]) @ true[keyframe.number], keyframe.T_sub_cam)[0])
     return float(np.median(off)) < JOINED_M
-
-
-def plan(found: Run, path: Path) -> None:
-    """True and estimated path from above, the latter aligned to the former."""
-    poses, true = trajectory(found.state), found.sequence.T_world_cam
-    T = align_rigid(poses[:, :3, 3], true[:, :3, 3])
-    aligned = (T @ poses)[:, :3, 3]
-    spread = np.ptp(true[:, :3, 3], axis=0)
-    x, y = np.sort(np.argsort(spread)[1:])  # the two directions in which the camera moves most
-    figure, axes = plt.subplots(figsize=(6, 6))
-    axes.plot(true[:, x, 3], true[:, y, 3], color="0.6", linewidth=3, label="true")
-    axes.plot(aligned[:, x], aligned[:, y], color="C3", linewidth=1, label="estimated")
-    axes.set_aspect("equal")
-    axes.set_xlabel("metres")
-    axes.legend()
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=100, bbox_inches="tight")
-    plt.close(figure)
 
 
 def in_a_process(task: Task, core: int) -> dict[str, Any]:
@@ -411,36 +434,44 @@ programs.
 """
 
 
-def in_sum(rows: list[dict[str, str]]) -> str:
-    """What the runs of a group say together, a line for each kind of sequence and switch."""
-    lines = []
-    for kind in dict.fromkeys(map(_kind, rows)):
-        words = _of_kind([row for row in rows if _kind(row) == kind])
-        lines.append(f"- {kind}: " + "; ".join(words))
-    return "\n".join(lines) + "\n"
+def sums(rows: list[dict[str, str]]) -> str:
+    """What runs say together, a row for each kind of sequence and switch."""
+    kinds = [[row for row in rows if _kind(row) == kind] for kind in dict.fromkeys(map(_kind, rows))]
+    return table([summed(chosen) for chosen in kinds])
 
 
-def _of_kind(rows: list[dict[str, str]]) -> list[str]:
+def summed(rows: list[dict[str, str]]) -> dict[str, str]:
+    """Runs of one kind."""
+
     def column(key: str) -> np.ndarray:
         values = np.array([float(row.get(key) or "nan") for row in rows])
         return values[np.isfinite(values)]
 
-    def total(key: str) -> int:
-        return int(column(key).sum())
+    def share(part: str, whole: str) -> str:
+        return f"{int(column(part).sum())} of {int(column(whole).sum())}" if column(whole).sum() else "-"
 
-    words, ate = [f"{len(rows)} run" + "s" * (len(rows) > 1)], column("ate_cm")
-    if failed := sum(bool(row.get("failed")) for row in rows):
-        words.append(f"{failed} failed")
-    if len(ate):
-        words.append(f"ATE {ate.mean():.2f} cm in the mean and {ate.max():.2f} at most")
-        words.append(f"{total('lost')} frames lost, {total('wrong_ok')} `ok` and far off")
-        words.append(f"{total('loops_found')} of {total('loops_true')} true loops found")
-        words.append(f"{total('loops_false')} false kept")
+    def mean(key: str, form: str) -> str:
+        return format(column(key).mean(), form) if len(column(key)) else "-"
+
     near, elsewhere = column("near_change_mm"), column("elsewhere_mm")
-    if len(near):
-        ratio = near.mean() / elsewhere.mean()
-        words.append(f"near a change of submap {ratio:.2f} times as far off as elsewhere")
-    return words
+    failed = sum(bool(row.get("failed")) for row in rows)
+    return {
+        "sequences": _kind(rows[0]),
+        "runs": f"{len(rows)}" + (f", {failed} failed" if failed else ""),
+        "frames": f"{int(column('frames').sum())}",
+        "ATE, cm: mean": mean("ate_cm", ".2f"),
+        "at most": f"{column('ate_cm').max():.2f}" if len(column("ate_cm")) else "-",
+        "weak": f"{int(column('weak').sum())}",
+        "lost": f"{int(column('lost').sum())}",
+        "ok, yet 30 cm off": f"{int(column('wrong_ok').sum())}",
+        "true loops found": share("loops_found", "loops_true"),
+        "false loops kept": f"{int(column('loops_false').sum())}",
+        "near a change of submap": f"{near.mean() / elsewhere.mean():.2f}" if len(near) else "-",
+        "within 3 deviations": mean("within_3_deviations", ".1%"),
+        "called contradictory": f"{sum(row.get('contradicted') == 'True' for row in rows)}",
+        "accuracy, cm": mean("accuracy_cm", ".2f"),
+        "completion at 5 cm": mean("completion", ".1%"),
+    }
 
 
 def _kind(row: Mapping[str, str]) -> str:
@@ -452,19 +483,36 @@ def _kind(row: Mapping[str, str]) -> str:
     return name if row["switch"] == "full" else f"{name}, {row['switch']}"
 
 
-def write_page() -> Path:
+def write_page() -> None:
+    """`docs/held.md`, and the table of the README between its marks."""
     rows = read_rows("held", RESULTS)
     parts = [PAGE.format(code=code())]
     for group in dict.fromkeys(row["group"] for row in rows):
         chosen = [row for row in rows if row["group"] == group]
         shown = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in chosen)}
-        parts += [f"## {group.capitalize()}\n", in_sum(chosen)]
-        parts.append("| " + " | ".join(shown.values()) + " |\n" + "|---" * len(shown) + "|")
-        parts += ["| " + " | ".join(row.get(key, "") for key in shown) + " |" for row in chosen]
-        parts.append("")
-    path = ROOT / "docs" / "held.md"
-    path.write_text("\n".join(parts))
-    return path
+        parts += [f"## {group.capitalize()}\n", sums(chosen), ""]
+        parts += [table([{title: row.get(key, "") for key, title in shown.items()} for row in chosen]), ""]
+    (RESULTS / "held.md").write_text("\n".join(parts))
+    readme = ROOT / "README.md"
+    before, _, rest = readme.read_text().partition(MARKS[0])
+    _, _, after = rest.partition(MARKS[1])
+    shown = sums([row for row in rows if row["group"] in FIGURES])
+    readme.write_text(f"{before}{MARKS[0]}\n\n{shown}\n\n{MARKS[1]}{after}")
+    if all((OUT / f"held-{name}.npz").exists() for name in PLANS):
+        draw_plans()
+
+
+def draw_plans() -> None:
+    """`docs/held.png`: paths from above, four together."""
+    figure, axes = plt.subplots(2, 2, figsize=(10, 10))
+    for name, ax in zip(PLANS, axes.flat, strict=True):
+        with np.load(OUT / f"held-{name}.npz") as file:
+            plan(ax, file["poses"], file["true"])
+        ax.set_title(name.split("-1-")[0], fontsize=10)
+    axes[0, 0].legend()
+    figure.tight_layout()
+    figure.savefig(RESULTS / "held.png", dpi=80)
+    plt.close(figure)
 
 
 def main() -> None:
@@ -483,7 +531,7 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=0, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.page:
-        print(write_page())
+        write_page()
     elif options.one:
         os.sched_setaffinity(0, {options.core})
         print(json.dumps(done(Task(*json.loads(options.one)))))

@@ -12,7 +12,8 @@ from mipsjax.config_tracking import BrightnessConfig, CornerConfig, TrackConfig
 from mipsjax.core import mapping
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame
-from mipsjax.landmarks import follow_all, images_of, landmarks, placed, with_corners
+from mipsjax.host.corners import Corners
+from mipsjax.landmarks import corners_of, follow_all, images_of, landmarks, placed, with_corners
 from mipsjax.policy import Status
 from mipsjax.state import FrameInfo, Keyframe, Pose, Record, SlamState, Submap, distance
 from painted import CAMERA, painting, pose, wall
@@ -31,6 +32,10 @@ def frame(place: int, color: bool = True) -> Frame:
     return Frame(place, place / 30, np.repeat(grey[..., None], 3, axis=2) if color else None, depth)
 
 
+def own(place: int, cfg: Config = CFG, color: bool = True) -> Corners | None:
+    return corners_of(frame(place, color), place, CAMERA, cfg)
+
+
 def travelled(keyframes: tuple[int, ...], until: int, cfg: Config = CFG) -> SlamState:
     """After frames 0 to `until` at true poses, in one submap whose anchor is the first."""
     anchor = Keyframe(0, np.zeros((1, 1), np.float32), np.zeros((1, 1, 3), np.uint8), np.eye(4))
@@ -39,7 +44,8 @@ def travelled(keyframes: tuple[int, ...], until: int, cfg: Config = CFG) -> Slam
         info = FrameInfo(keyframe=place in keyframes)
         record = Record(place, place / 30, 0, 0, PATH[place], Status.OK, info)
         found = follow_all(state, frame(place), PATH[max(place - 1, 0)], cfg)
-        state = with_corners(state._replace(records=(*state.records, record)), frame(place), found, cfg)
+        state = state._replace(records=(*state.records, record))
+        state = with_corners(state, own(place, cfg), found, cfg)
     return state
 
 
@@ -57,8 +63,8 @@ def test_a_keyframe_that_is_out_of_sight_is_let_go():
     assert [seen.reference.record for seen in found] == [3, 1, 0]
     record = state.records[-1]._replace(T_keyframe_cam=PATH[4])
     later = state._replace(records=(*state.records, record))
-    assert [c.record for c in with_corners(later, frame(4), found[:2], CFG).corners] == [4, 1]
-    assert [c.record for c in with_corners(later, frame(4), [], CFG).corners] == [4, 1, 0]
+    assert [c.record for c in with_corners(later, own(4), found[:2], CFG).corners] == [4, 1]
+    assert [c.record for c in with_corners(later, own(4), [], CFG).corners] == [4, 1, 0]
 
 
 def test_each_frame_says_where_the_camera_is():
@@ -90,7 +96,7 @@ def test_frames_of_another_submap_say_nothing_unless_one_was_begun_from_the_othe
 def test_without_colour_or_corners_there_is_nothing_to_follow():
     state = travelled((0,), until=2)
     assert follow_all(state, frame(3, color=False), PATH[2], CFG) == []
-    assert with_corners(state, frame(2, color=False), [], CFG) is state
+    assert own(3, color=False) is None and with_corners(state, None, [], CFG) is state
     none = replace(
         CFG, track=TrackConfig(corners=CornerConfig(count=0), brightness=BrightnessConfig(weight=0.0))
     )

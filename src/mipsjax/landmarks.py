@@ -117,16 +117,12 @@ def corners_of(frame: Frame, record: int, camera: Intrinsics, cfg: Config) -> Co
     return corners(grey_of(frame.color), frame.depth, record, count, camera)
 
 
-def with_corners(state: SlamState, frame: Frame, found: list[Seen], cfg: Config) -> SlamState:
+def with_corners(state: SlamState, newest: Corners | None, found: list[Seen], cfg: Config) -> SlamState:
     """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far.
 
     `found` are those that the frame showed. The newest keyframe is kept, and of the others the oldest, as long as they
     are seen: the longer a corner is followed, the less the camera drifts.
     """
-    last, keyframe = len(state.records) - 1, state.submap.keyframes[-1]
-    newest = keyframe.corners if keyframe.number == last else None
-    if newest is None:
-        newest = corners_of(frame, last, state.camera, cfg)
     if newest is None:
         return state
     wanted = cfg.track.corners

@@ -16,6 +16,7 @@ from mipsjax.closure import close, prepare
 from mipsjax.config import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame
+from mipsjax.host.corners import Corners
 from mipsjax.host.features import detect
 from mipsjax.host.held import at, deviations
 from mipsjax.host.trust import RECENT
@@ -50,14 +51,16 @@ def start(frame: Frame, camera: Intrinsics, cfg: Config, T_world_sub: Pose | Non
     `T_world_sub` is the pose of that frame in the world, the identity if none is given.
     """
     began = perf_counter()
-    anchor = _keyframe(frame.cleaned(), 0, np.eye(4), cfg, camera)
+    frame = frame.cleaned()
+    corners = corners_of(frame, 0, camera, cfg)
+    anchor = _keyframe(frame, 0, np.eye(4), corners, cfg, camera)
     T_world_sub = np.eye(4) if T_world_sub is None else T_world_sub
     submap, ok = begin(anchor, [], T_world_sub, cfg.map.first_steps, camera, cfg)
     info = FrameInfo(
         keyframe=True, map_steps=cfg.map.first_steps, map_ms=_ms(began), note="" if ok else "map not finite"
     )
     record = Record(frame.number, frame.timestamp, 0, 0, np.eye(4), Status.OK, info)
-    state = with_corners(SlamState((submap,), 0, (record,), camera, 0), frame.cleaned(), [], cfg)
+    state = with_corners(SlamState((submap,), 0, (record,), camera, 0), corners, [], cfg)
     prepare(state, cfg)
     return state
 
@@ -93,7 +96,8 @@ def step(state: SlamState, frame: Frame, cfg: Config, executor: Executor = INLIN
         frame = frame._replace(problem=_few(stats.measured))
     learned = _learn(state, frame, tracked, decision, cfg)
     if decision.tells:
-        learned = with_corners(_moved_on(learned, state, tracked, stats.residual), frame, tracked.found, cfg)
+        learned = _moved_on(learned, state, tracked, stats.residual)
+        learned = with_corners(learned, tracked.corners, tracked.found, cfg)
         if tracked.doubt is not None:
             learned = learned._replace(doubts=(*learned.doubts, tracked.doubt)[-RECENT:])
     state = learned
@@ -121,7 +125,7 @@ def _recover(state: SlamState, frame: Frame, note: str, tracked: Tracked, cfg: C
     assert frame.depth is not None
     place, found = None, ""
     if cfg.loop.relocalise and frame.color is not None:
-        keyframe = _keyframe(frame, len(state.records), np.eye(4), cfg, state.camera)
+        keyframe = _keyframe(frame, len(state.records), np.eye(4), tracked.corners, cfg, state.camera)
         place = find_again(state, keyframe, cfg)
         if place is not None:
             found = "again"
@@ -150,7 +154,10 @@ def _learn(
     mapped = frame.color is not None and decision.map_steps > 0
     made = mapped and decision.keyframe
     if mapped:
-        current = (_keyframe if made else make_keyframe)(frame, number, T_sub_cam, cfg, state.camera)
+        if made:
+            current = _keyframe(frame, number, T_sub_cam, tracked.corners, cfg, state.camera)
+        else:
+            current = make_keyframe(frame, number, T_sub_cam, cfg, state.camera)
         current = current._replace(covariance=tracked.held.covariance)
         chosen = choose(state.submap, cfg.map.frames - 2, (cfg.seed, CHOOSE, number))
         batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
@@ -178,11 +185,13 @@ def _learn(
     return state._replace(records=(*state.records, record), trouble=trouble)
 
 
-def _keyframe(frame: Frame, number: int, T_sub_cam: Pose, cfg: Config, camera: Intrinsics) -> Keyframe:
-    """With features, and with corners to be followed into other keyframes, if they are wanted."""
+def _keyframe(
+    frame: Frame, number: int, T_sub_cam: Pose, corners: Corners | None, cfg: Config, camera: Intrinsics
+) -> Keyframe:
+    """With features, and with its corners, to be followed into other keyframes, if they are wanted."""
     keyframe = make_keyframe(frame, number, T_sub_cam, cfg, camera)
     if cfg.pairs.wanted:
-        keyframe = keyframe._replace(corners=corners_of(frame, number, camera, cfg))
+        keyframe = keyframe._replace(corners=corners)
     if not ((cfg.loop.enabled and cfg.loop.features) or cfg.loop.relocalise):
         return keyframe
     assert frame.depth is not None and frame.color is not None

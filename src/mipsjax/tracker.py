@@ -13,9 +13,10 @@ from mipsjax.bundle import TRACK, nearest, random_key, views_of
 from mipsjax.config import Config
 from mipsjax.core import tracking
 from mipsjax.data.sequence import Frame
+from mipsjax.host.corners import Corners
 from mipsjax.host.held import NONE, Directions, Gains, Held, Matrix, at, directions, gains, held, predicted
 from mipsjax.host.trust import ALLOWED_TRACKED, Differing, differing, trusted
-from mipsjax.landmarks import Seen, follow_all, images_of, landmarks, placed
+from mipsjax.landmarks import Seen, corners_of, follow_all, images_of, landmarks, placed
 from mipsjax.policy import Status, converged, widening
 from mipsjax.state import Keyframe, Pose, Record, SlamState, deviations_of, distance, last_pose, rigid
 
@@ -33,6 +34,8 @@ class Tracked(NamedTuple):
     info: tracking.TrackInfo
     found: list[Seen]
     """Corners of earlier frames."""
+    corners: Corners | None
+    """Its own; None where they are not wanted, or cannot be."""
     surfaces: Directions
     """How firmly surfaces hold it."""
     together: Directions
@@ -71,6 +74,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         images_of([] if frame.color is None else placed(state, cfg), earlier, state.camera, cfg),
         np.float32(trust),
     )
+    corners = corners_of(frame, len(state.records), state.camera, cfg)  # while that is computed
     T, info = jax.device_get((T, info))
     surfaces, colour = _information(info, cfg)
     information, found_at = surfaces + trust * colour, rigid(T)
@@ -83,6 +87,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         T_as_moved,
         info,
         found,
+        corners,
         directions(surfaces),
         together,
         differing(info.information.to_surfaces - info.information.to_colour, surfaces, colour),

@@ -200,8 +200,9 @@ def map_loss(
 ) -> tuple[Float[Array, ""], tuple[optax.Updates, Float[Array, "F 6"]]]:
     """The mapping loss on one draw of pixels and samples of every frame (Eq. 18), and its gradient.
 
-    The gradient is that for the networks and for a twist (v, omega) of each frame, and is summed over chunks of
-    rays: the losses are means over the whole draw, so their normalisers are counted before.
+    The gradient is that for the networks and for a twist (v, omega) of each frame, 0 where poses are not to learn
+    (`map.pose_learning_rate` 0), and is summed over chunks of rays: the losses are means over the whole draw, so their
+    normalisers are counted before.
     """
     chunks = draw(field, frames, key, camera, cfg)
     measured = chunks.pixels.depth > 0
@@ -262,6 +263,8 @@ def _share_of_loss(
     field: nf.Field, twist: Float[Array, "F 6"], frames: Frames, batch: Batch, totals: Totals, cfg: Config
 ) -> Float[Array, ""]:
     """What a batch adds to the loss of the whole draw."""
+    if not cfg.map.pose_learning_rate:
+        twist = jax.lax.stop_gradient(twist)  # an eighth of a step otherwise
     points = _points(moved(frames, twist), batch.frame, batch.pixels, batch.samples.depth)
     total, finest = jnp.zeros(()), None
     if field.smooth is not None:
