@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mipsjax.config import Config
-from mipsjax.core.camera import project
-from mipsjax.core.equations import System, descend
+from mipsjax.core.camera import project, rays
+from mipsjax.core.equations import Points, System, descend
 from mipsjax.core.photometric import (
     FEWEST,
     LEVELS,
@@ -20,6 +20,8 @@ from mipsjax.core.photometric import (
     pyramid,
     with_noise,
 )
+from mipsjax.core.solvers import Evidence, approach
+from mipsjax.core.views import Views
 from painted import CAMERA, painting, pose, wall
 
 CFG = Config()
@@ -171,6 +173,28 @@ def test_a_coarse_level_alone_is_not_biased():
         shade = with_noise(seen(wall(SECOND, PAINTED)[0], usual(), level), T, CAMERA, CFG)
         end = descend(lambda T, shade=shade: brightness_system(T, shade, CAMERA, CFG), T, 10)
         assert off(np.asarray(end, np.float64)) < EXACT_M * 2**level
+
+
+def test_from_far_off_coarse_images_and_depth_lead_near():
+    """Six pixels, where the finest level alone goes astray; without a map, as in front of what is not learned yet.
+    Depth holds what lies across the wall, images the rest."""
+    grey, depth = wall(SECOND, PAINTED)
+    v, u = (axis.ravel() for axis in np.mgrid[4:240:8, 4:320:8])
+    p_cam = rays(jnp.asarray(v), jnp.asarray(u), CAMERA) * depth[v, u][:, None]
+    points = Points(p_cam, jnp.zeros_like(p_cam), jnp.ones(len(v), bool))
+    views = Views(usual().depth, usual().T_sub_cam)
+    levels = [Evidence(points, views, shades=seen(grey, usual(), level)) for level in range(LEVELS)]
+    far = jnp.asarray(SECOND @ pose((-0.4, 1, 0.4), (0.012, 0.008, -0.012)), jnp.float32)
+
+    def after(tried: list[Evidence], steps: int) -> float:
+        T = far
+        for level in tried:
+            T = approach(T, level, steps, CAMERA, CFG)
+        return off(np.asarray(T, np.float64))
+
+    steps = CFG.track.brightness.coarse_steps
+    assert off(np.asarray(far, np.float64)) > 0.03 and after(levels[:1], 2 * steps) > 0.03
+    assert after(levels[:0:-1], steps) < EXACT_M
 
 
 def test_to_lose_sight_of_the_images_is_never_better():
