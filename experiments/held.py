@@ -216,13 +216,16 @@ def done(task: Task) -> dict[str, Any]:
 
 
 def keep(found: Run, mesh: trimesh.Trimesh, name: str) -> None:
-    """Poses, status and submap of each frame, the mesh, and a plan."""
+    """Poses, status and submap of each frame, loops, the mesh, and a plan."""
     OUT.mkdir(exist_ok=True)
     mesh.export(OUT / f"{name}.ply")
     records, poses, true = found.state.records, trajectory(found.state), found.sequence.T_world_cam
     status = [record.status.value for record in records]
     submap = [record.submap for record in records]
-    np.savez_compressed(OUT / f"{name}.npz", poses=poses, true=true, status=status, submap=submap)
+    loops = [(loop.frame, loop.first, loop.second, loop.how, loop.weight) for loop in found.state.loops]
+    np.savez_compressed(
+        OUT / f"{name}.npz", poses=poses, true=true, status=status, submap=submap, loops=loops
+    )
     figure, axes = plt.subplots(figsize=(6, 6))
     plan(axes, poses, true)
     axes.legend()
