@@ -1,19 +1,18 @@
-"""What holds the camera, in scenes that nobody tuned on: one command for a whole table, on two cores at once.
+"""What holds the camera, in recordings and in drawn homes: one command for a whole table, on two cores at once.
 
     python experiments/held.py [--groups large homes ...] [--seeds 0 1 2] [--only bookstore ...] [--again]
-    python experiments/held.py --page
 
 Each run is a process held to one core, two at a time. Writes `docs/held.csv`, a row a run, as each of them ends, and
 in `experiments/out`, where the truth is known, the poses, the mesh and a plan of each: the true and the estimated path
 from above. The whole table takes hours: runs of which there is a row of the same code, by a digest of `src/`, are left
-out unless `--again`. `--page` writes `docs/held.md` and the table of the README from the CSV, and `docs/held.png` where
-the runs that it shows were made here.
+out unless `--again`. `held_page.py` makes a page of the CSV.
 
-Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, slow
-and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is not; `rooms` and
-`kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `wrong-depth`, depth
-that is not what a sequence says, measured along the ray or in whole metres, of which a run must say so; `colour`,
-colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last frame.
+Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, on which
+nobody tuned, slow and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is
+not; `rooms` and `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `wrong-
+depth`, depth that is not what a sequence says, measured along the ray or in whole metres, of which a run must say so;
+`colour`, colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last
+frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
@@ -26,8 +25,6 @@ aligned.
 from __future__ import annotations
 
 import argparse
-import ast
-import hashlib
 import json
 import os
 import subprocess
@@ -45,7 +42,7 @@ import trimesh
 from matplotlib.axes import Axes
 from scipy.spatial import KDTree
 
-from common import DATA, OUT, ROOT, Altered, Run, changed, read_rows, run, show, table, write_rows
+from common import DATA, OUT, ROOT, Altered, Run, changed, code, read_rows, run, show, write_rows
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
 from mipsjax.data.sequence import Frame, Sequence
@@ -71,29 +68,6 @@ FLAT = 128
 """Grey of an image that shows nothing."""
 RESULTS = ROOT / "docs"
 TEST_HOMES, TUNING_HOMES = range(1, 11), range(101, 111)
-MARKS = "<!-- held.py --page -->", "<!-- end -->"
-"""What the README has its table between."""
-FIGURES = "rooms", "kitchen", "large", "homes", "loops"
-"""Groups that the README shows."""
-IN_README = (
-    "sequences",
-    "runs",
-    "frames",
-    "ATE, cm: mean",
-    "at most",
-    "lost",
-    "ok, yet 30 cm off",
-    "true loops found",
-    "false loops kept",
-)
-"""Columns that it shows of their sums."""
-PLANS = (
-    "bookstore-1-full-0",
-    "home-2-fast+noise+blur-1-full-0",
-    "home-4-fast+noise+blur-1-full-0",
-    "home-6-fast+noise+blur-1-full-0",
-)
-"""Runs of which plans are shown together."""
 
 
 class Task(NamedTuple):
@@ -201,7 +175,7 @@ def done(task: Task) -> dict[str, Any]:
         return seen if altered is None else Altered(seen, altered)
 
     found = run(path, cfg, frames=frames, seed=task.seed, see=see)
-    row = task._asdict() | found.row | {"sequence": _short(task.name)}
+    row = task._asdict() | found.row | {"sequence": short(task.name)}
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share
     row["contradicted"] = agreement is not None and agreement.begins is not None
@@ -210,26 +184,37 @@ def done(task: Task) -> dict[str, Any]:
         row |= slides(found) | wrong(found) | stated(found.state, found) | near_changes(found)
         mesh = reconstruct(found.state, cfg)
         row |= loops(found.state, found, cfg) | surface(mesh, Path(path) / "observed.npz")
-        name = "-".join(map(str, ("held", row["sequence"].replace("/", "-"), *task[2:])))
-        keep(found, mesh, name)
+        keep(found, mesh, OUT / stem(task))
     return row
 
 
-def keep(found: Run, mesh: trimesh.Trimesh, name: str) -> None:
-    """Poses, status and submap of each frame, loops, the mesh, and a plan."""
-    OUT.mkdir(exist_ok=True)
-    mesh.export(OUT / f"{name}.ply")
+def stem(task: Task) -> str:
+    """Name of the files that are kept of a run, without ending."""
+    return f"held-{short(task.name).replace('/', '-')}-{task.stride}-{task.switch}-{task.seed}"
+
+
+def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
+    """Writes, each with its own ending, poses, status and submap of each frame with the loops (frame, two submaps; how;
+    kept or not), the mesh, and a plan."""
+    path.parent.mkdir(exist_ok=True)
+    mesh.export(path.with_name(f"{path.name}.ply"))
     records, poses, true = found.state.records, trajectory(found.state), found.sequence.T_world_cam
-    status = [record.status.value for record in records]
-    submap = [record.submap for record in records]
-    loops = [(loop.frame, loop.first, loop.second, loop.how, loop.weight) for loop in found.state.loops]
+    closed = found.state.loops
     np.savez_compressed(
-        OUT / f"{name}.npz", poses=poses, true=true, status=status, submap=submap, loops=loops
+        path.with_name(f"{path.name}.npz"),
+        code=code(),
+        poses=poses,
+        true=true,
+        status=[record.status.value for record in records],
+        submap=[record.submap for record in records],
+        loops=np.array([(loop.frame, loop.first, loop.second) for loop in closed], int).reshape(-1, 3),
+        how=[loop.how for loop in closed],
+        kept=[loop.weight > 0 for loop in closed],
     )
     figure, axes = plt.subplots(figsize=(6, 6))
     plan(axes, poses, true)
     axes.legend()
-    figure.savefig(OUT / f"{name}.png", dpi=100, bbox_inches="tight")
+    figure.savefig(path.with_name(f"{path.name}.png"), dpi=100, bbox_inches="tight")
     plt.close(figure)
 
 
@@ -355,7 +340,7 @@ def in_a_process(task: Task, core: int) -> dict[str, Any]:
     command = [sys.executable, __file__, "--one", json.dumps(task), "--core", str(core)]
     ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if ended.returncode:
-        return task._asdict() | {"sequence": _short(task.name), "failed": f"exit code {ended.returncode}"}
+        return task._asdict() | {"sequence": short(task.name), "failed": f"exit code {ended.returncode}"}
     return json.loads(ended.stdout.splitlines()[-1])
 
 
@@ -383,152 +368,13 @@ def all_of(wanted: list[Task], workers: int, again: bool) -> None:
             write_rows("held", rows.values(), RESULTS)
 
 
-def code(source: Path = ROOT / "src") -> str:
-    """What tells programs apart: a digest of all of `src/` without its comments and docstrings."""
-    digest = hashlib.sha256()
-    for path in sorted(source.rglob("*.py")):
-        tree = ast.parse(path.read_text())
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                node.body = [line for line in node.body if not _is_text(line)] or [ast.Pass()]
-        digest.update(f"{path.relative_to(source)} {ast.dump(tree)}".encode())
-    return digest.hexdigest()[:8]
-
-
-def _is_text(line: ast.stmt) -> bool:
-    return (
-        isinstance(line, ast.Expr)
-        and isinstance(line.value, ast.Constant)
-        and isinstance(line.value.value, str)
-    )
-
-
-def _short(name: str) -> str:
+def short(name: str) -> str:
+    """A sequence without the kind of its source."""
     return name.removeprefix("synth:")
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(str(row[field]) for field in Task._fields)
-
-
-COLUMNS = {
-    "sequence": "sequence",
-    "stride": "every",
-    "switch": "switch",
-    "seed": "seed",
-    "ate_cm": "ATE, cm",
-    "off_max_cm": "largest error, cm",
-    "slide_max_cm": "largest slide, cm",
-    "turn_max_deg": "largest turn, degrees",
-    "ok": "ok",
-    "weak": "weak",
-    "lost": "lost",
-    "wrong_ok": "ok and over 30 cm off",
-    "within_3_deviations": "within 3 deviations",
-    "looked_through": "looked through",
-    "contradicted": "depth contradicts itself",
-    "submaps": "submaps",
-    "loops_true": "true loops",
-    "loops_found": "found",
-    "loops_false": "false kept",
-    "near_change_mm": "near a change, mm",
-    "elsewhere_mm": "elsewhere, mm",
-    "accuracy_cm": "accuracy, cm",
-    "left_out": "left out of it",
-    "completion": "completion at 5 cm",
-    "fps_online": "frames/s of one core",
-    "code": "code",
-    "failed": "failed",
-}
-PAGE = """# Held everywhere
-
-What holds the camera on sequences that nobody tuned on. Made by `python experiments/held.py --page` from `held.csv`
-beside it, which `python experiments/held.py` writes; what the columns mean is in its docstring. Default preset, each
-run held to one core; `code` is a digest of the program. This page was made by {code}: rows of others are of earlier
-programs.
-"""
-
-
-def sums(rows: list[dict[str, str]], columns: tuple[str, ...] = ()) -> str:
-    """What runs say together, a row for each kind of sequence and switch; of some columns, or of all."""
-    kinds = [[row for row in rows if _kind(row) == kind] for kind in dict.fromkeys(map(_kind, rows))]
-    found = [summed(chosen) for chosen in kinds]
-    return table([{key: row[key] for key in columns or row} for row in found])
-
-
-def summed(rows: list[dict[str, str]]) -> dict[str, str]:
-    """Runs of one kind."""
-
-    def column(key: str) -> np.ndarray:
-        values = np.array([float(row.get(key) or "nan") for row in rows])
-        return values[np.isfinite(values)]
-
-    def share(part: str, whole: str) -> str:
-        return f"{int(column(part).sum())} of {int(column(whole).sum())}" if column(whole).sum() else "-"
-
-    def mean(key: str, form: str) -> str:
-        return format(column(key).mean(), form) if len(column(key)) else "-"
-
-    near, elsewhere = column("near_change_mm"), column("elsewhere_mm")
-    failed = sum(bool(row.get("failed")) for row in rows)
-    return {
-        "sequences": _kind(rows[0]),
-        "runs": f"{len(rows)}" + (f", {failed} failed" if failed else ""),
-        "frames": f"{int(column('frames').sum())}",
-        "ATE, cm: mean": mean("ate_cm", ".2f"),
-        "at most": f"{column('ate_cm').max():.2f}" if len(column("ate_cm")) else "-",
-        "weak": f"{int(column('weak').sum())}",
-        "lost": f"{int(column('lost').sum())}",
-        "ok, yet 30 cm off": f"{int(column('wrong_ok').sum())}",
-        "true loops found": share("loops_found", "loops_true"),
-        "false loops kept": f"{int(column('loops_false').sum())}",
-        "near a change of submap": f"{near.mean() / elsewhere.mean():.2f}" if len(near) else "-",
-        "within 3 deviations": mean("within_3_deviations", ".1%"),
-        "called contradictory": f"{sum(row.get('contradicted') == 'True' for row in rows)}",
-        "accuracy, cm": mean("accuracy_cm", ".2f"),
-        "completion at 5 cm": mean("completion", ".1%"),
-    }
-
-
-def _kind(row: Mapping[str, str]) -> str:
-    """Homes are slow or fast; others are of their own kind."""
-    name = row["sequence"]
-    if name.startswith("home-"):
-        name = "fast homes" if "-fast" in name else "slow homes"
-    name += f", every {row['stride']}th frame" if row["stride"] != "1" else ""
-    return name if row["switch"] == "full" else f"{name}, {row['switch']}"
-
-
-def write_page() -> None:
-    """`docs/held.md`, and the table of the README between its marks."""
-    rows = read_rows("held", RESULTS)
-    parts = [PAGE.format(code=code())]
-    for group in dict.fromkeys(row["group"] for row in rows):
-        chosen = [row for row in rows if row["group"] == group]
-        shown = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in chosen)}
-        parts += [f"## {group.capitalize()}\n", sums(chosen), ""]
-        parts += [table([{title: row.get(key, "") for key, title in shown.items()} for row in chosen]), ""]
-    (RESULTS / "held.md").write_text("\n".join(parts))
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text().partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
-    shown = sums([row for row in rows if row["group"] in FIGURES], IN_README)
-    readme.write_text(f"{before}{MARKS[0]}\n\n{shown}\n\n{MARKS[1]}{after}")
-    if all((OUT / f"held-{name}.npz").exists() for name in PLANS):
-        draw_plans()
-
-
-def draw_plans() -> None:
-    """`docs/held.png`: paths from above, four together."""
-    figure, axes = plt.subplots(2, 2, figsize=(10, 10))
-    for name, ax in zip(PLANS, axes.flat, strict=True):
-        with np.load(OUT / f"held-{name}.npz") as file:
-            plan(ax, file["poses"], file["true"])
-        ax.set_title(name.split("-1-")[0], fontsize=10)
-    axes[0, 0].legend()
-    figure.tight_layout()
-    figure.savefig(RESULTS / "held.png", dpi=80)
-    plt.close(figure)
 
 
 def main() -> None:
@@ -542,13 +388,10 @@ def main() -> None:
     )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="also what there is a row of already")
-    parser.add_argument("--page", action="store_true")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     parser.add_argument("--core", type=int, default=0, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.page:
-        write_page()
-    elif options.one:
+    if options.one:
         os.sched_setaffinity(0, {options.core})
         print(json.dumps(done(Task(*json.loads(options.one)))))
     else:

@@ -118,10 +118,11 @@ def corners_of(frame: Frame, record: int, camera: Intrinsics, cfg: Config) -> Co
 
 
 def with_corners(state: SlamState, newest: Corners | None, found: list[Seen], cfg: Config) -> SlamState:
-    """With the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so far.
+    """With `newest`, the corners of the last frame, a trusted one, and with those of keyframes among the ones kept so
+    far; as it was where `newest` is None.
 
-    `found` are those that the frame showed. The newest keyframe is kept, and of the others the oldest, as long as they
-    are seen: the longer a corner is followed, the less the camera drifts.
+    `found` are the earlier frames that the last one showed. The newest keyframe is kept, and of the others the oldest,
+    as long as they are seen: the longer a corner is followed, the less the camera drifts.
     """
     if newest is None:
         return state

@@ -188,7 +188,8 @@ def _learn(
 def _keyframe(
     frame: Frame, number: int, T_sub_cam: Pose, corners: Corners | None, cfg: Config, camera: Intrinsics
 ) -> Keyframe:
-    """With features, and with its corners, to be followed into other keyframes, if they are wanted."""
+    """The keyframe that a frame becomes, with features where loops want them, and with its `corners` where keyframes
+    are measured against each other."""
     keyframe = make_keyframe(frame, number, T_sub_cam, cfg, camera)
     if cfg.pairs.wanted:
         keyframe = keyframe._replace(corners=corners)

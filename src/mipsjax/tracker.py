@@ -33,9 +33,9 @@ class Tracked(NamedTuple):
     """Where its motion led; the pose itself but for what measurements leave loose."""
     info: tracking.TrackInfo
     found: list[Seen]
-    """Corners of earlier frames."""
+    """Corners of earlier frames that it shows."""
     corners: Corners | None
-    """Its own; None where they are not wanted, or cannot be."""
+    """Those of the frame itself; None without colour, or where neither corners nor brightness are wanted."""
     surfaces: Directions
     """How firmly surfaces hold it."""
     together: Directions
@@ -74,7 +74,8 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         images_of([] if frame.color is None else placed(state, cfg), earlier, state.camera, cfg),
         np.float32(trust),
     )
-    corners = corners_of(frame, len(state.records), state.camera, cfg)  # while that is computed
+    # JAX computes the pose meanwhile: nothing waits for it before device_get
+    corners = corners_of(frame, len(state.records), state.camera, cfg)
     T, info = jax.device_get((T, info))
     surfaces, colour = _information(info, cfg)
     information, found_at = surfaces + trust * colour, rigid(T)

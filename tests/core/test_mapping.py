@@ -100,17 +100,16 @@ def test_frames_that_may_not_move_do_not(corner_map, jolted):
     np.testing.assert_array_equal(poses, jolted.T_sub_cam)
 
 
-def test_networks_learn_the_same_whether_poses_may_not_move_or_do_not_learn(fresh, corner_frames):
+def test_networks_learn_the_same_whether_poses_learn_or_not(fresh, corner_frames):
     fixed = replace(CFG, map=replace(CFG.map, pose_learning_rate=0.0))
-    assert CFG.map.pose_learning_rate
-    still = corner_frames._replace(movable=np.zeros(5, np.float32))
 
-    def gradient(frames, cfg):
-        return jax.jit(lambda field: mapping.map_loss(field, frames, KEY, CAMERA, cfg)[1])(fresh.field)
+    def gradient(cfg):
+        return jax.jit(lambda field: mapping.map_loss(field, corner_frames, KEY, CAMERA, cfg)[1])(fresh.field)
 
-    (expected, _), (networks, twist) = gradient(still, CFG), gradient(corner_frames, fixed)
-    assert not np.any(twist) and np.any(gradient(corner_frames, CFG)[1])
+    (expected, moving), (networks, still) = gradient(CFG), gradient(fixed)
+    assert np.any(moving) and not np.any(still)
     for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(networks), strict=True):
+        # The two programs may round differently
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
 
 

@@ -67,16 +67,15 @@ def found(grey: np.ndarray, of: Images) -> np.ndarray:
 def off(T: np.ndarray) -> float:
     """Metres, or as many radians."""
     error = np.linalg.inv(SECOND) @ T
-    return float(
-        np.abs(np.concatenate([error[:3, 3], (error[:3, :3] - error[:3, :3].T)[np.triu_indices(3, 1)]])).max()
-    )
+    turn = (error[:3, :3] - error[:3, :3].T)[np.triu_indices(3, 1)] / 2
+    return float(np.abs(np.concatenate([error[:3, 3], turn])).max())
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.7, 15.0)])
 def test_the_pose_is_found_along_a_plain_wall_in_any_light(gain: float, offset: float):
     """Of which surfaces say nothing. An offset and a gain are the image's own."""
     grey = gain * wall(SECOND, PAINTED)[0] + offset
-    assert off(GUESS) > 0.01
+    assert off(GUESS) > 0.009
     assert off(found(grey, usual())) < EXACT_M
 
 
@@ -176,10 +175,10 @@ def test_a_coarse_level_alone_is_not_biased():
 
 
 def test_from_far_off_coarse_images_and_depth_lead_near():
-    """Six pixels, where the finest level alone goes astray; without a map, as in front of what is not learned yet.
+    """Eight pixels, where the finest level alone goes astray; without a map, as in front of what is not learned yet.
     Depth holds what lies across the wall, images the rest."""
     grey, depth = wall(SECOND, PAINTED)
-    v, u = (axis.ravel() for axis in np.mgrid[4:240:8, 4:320:8])
+    v, u = (axis.ravel() for axis in np.mgrid[4 : CAMERA.height : 8, 4 : CAMERA.width : 8])
     p_cam = rays(jnp.asarray(v), jnp.asarray(u), CAMERA) * depth[v, u][:, None]
     points = Points(p_cam, jnp.zeros_like(p_cam), jnp.ones(len(v), bool))
     views = Views(usual().depth, usual().T_sub_cam)
@@ -192,8 +191,8 @@ def test_from_far_off_coarse_images_and_depth_lead_near():
             T = approach(T, level, steps, CAMERA, CFG)
         return off(np.asarray(T, np.float64))
 
-    steps = CFG.track.brightness.coarse_steps
-    assert off(np.asarray(far, np.float64)) > 0.03 and after(levels[:1], 2 * steps) > 0.03
+    steps, begun = CFG.track.brightness.coarse_steps, off(np.asarray(far, np.float64))
+    assert after(levels[:1], (LEVELS - 1) * steps) > begun
     assert after(levels[:0:-1], steps) < EXACT_M
 
 
