@@ -15,11 +15,11 @@ depth`, depth that is not what a sequence says, measured along the ray or in who
 frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
-hides. A true loop is a pair of submaps, far along the chain, of which the camera saw the same: from keyframes less than
-a metre and 30 degrees apart. It is found if the pair is joined in the end, within 10 cm of the truth; a pair joined
-otherwise is false. Accuracy is the mean distance of the mesh to the surface that was seen, where a recording comes with
-it, without what is farther off than 20 cm, and completion the share of that surface within 5 cm of the mesh; no mesh is
-aligned.
+hides. A true loop is a pair of submaps, far along the chain, in which the camera saw the same: three tenths of what a
+keyframe of one measured, in a keyframe of the other, less than a metre and 30 degrees apart. It is found if the pair is
+joined in the end, within 10 cm of the truth; a pair joined otherwise is false. Accuracy is the mean distance of the
+mesh to the surface that was seen, where a recording comes with it, without what is farther off than 20 cm, and
+completion the share of that surface within 5 cm of the mesh; no mesh is aligned.
 """
 
 from __future__ import annotations
@@ -43,8 +43,10 @@ from matplotlib.axes import Axes
 from scipy.spatial import KDTree
 
 from common import DATA, OUT, ROOT, Altered, Run, changed, code, read_rows, run, show, write_rows
+from mipsjax.bundle import mapping_camera
 from mipsjax.compilation import enable_cache
 from mipsjax.config import Config
+from mipsjax.core.camera import Intrinsics
 from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.host.metrics import align_rigid
 from mipsjax.judge import judged
@@ -57,7 +59,10 @@ from mipsjax.state import SlamState, deviations_of, distance, inverse, pose_of, 
 SLIDE_FRAMES = 12
 CHANGE_FRAMES = 15
 """Frames after and before a change of submap that count as near it."""
-SEEN_AGAIN_M, SEEN_AGAIN_DEG = 1.0, 30.0
+SEEN_AGAIN_M, SEEN_AGAIN_DEG, SEEN_AGAIN = 1.0, 30.0, 0.3
+"""How near to an earlier frame another must be, and the share of what it measured that it must show."""
+SAME_M, SAME = 0.05, 0.02
+"""Metres, and share of the depth, by which two measurements of one surface may differ."""
 JOINED_M = 0.1
 FAR_M, NEAR_M = 0.2, 0.05
 """Of a mesh: parts farther off count apart, true surface this near to it is complete."""
@@ -213,6 +218,7 @@ def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
     )
     figure, axes = plt.subplots(figsize=(6, 6))
     plan(axes, poses, true)
+    axes.set_title(f"{path.name} ({code()})", fontsize=8)
     axes.legend()
     figure.savefig(path.with_name(f"{path.name}.png"), dpi=100, bbox_inches="tight")
     plt.close(figure)
@@ -304,15 +310,16 @@ def loops(state: SlamState, found: Run, cfg: Config) -> dict[str, Any]:
     """True loops, those of them that were found, and false ones that were kept."""
     true, joined = found.sequence.T_world_cam, set(linked_pairs(state))
     away = [chain_distances(state, place) for place in range(len(state.submaps))]
+    camera = mapping_camera(state.camera, cfg)
     own = [
-        [true[k.number] for k in submap.keyframes if state.records[k.number].submap == place]
+        [(k.depth, true[k.number]) for k in submap.keyframes if state.records[k.number].submap == place]
         for place, submap in enumerate(state.submaps)
     ]
     count = {"loops_true": 0, "loops_found": 0, "loops_false": 0}
     for j, k in product(range(len(state.submaps)), repeat=2):
         if j >= k or away[j][k] < cfg.loop.apart:
             continue
-        again = any(_seen_again(a, b) for a in own[j] for b in own[k])
+        again = any(seen_again(a, b, camera) for a in own[j] for b in own[k])
         right = (j, k) in joined and _rightly(state, j, k, true)
         count["loops_true"] += again
         count["loops_found"] += again and right
@@ -320,9 +327,31 @@ def loops(state: SlamState, found: Run, cfg: Config) -> dict[str, Any]:
     return count
 
 
-def _seen_again(a: np.ndarray, b: np.ndarray) -> bool:
-    metres, radians = distance(a, b)
-    return metres < SEEN_AGAIN_M and radians < np.radians(SEEN_AGAIN_DEG)
+Posed = tuple[np.ndarray, np.ndarray]
+"""A depth image, metres, and the true pose of its camera."""
+
+
+def seen_again(first: Posed, second: Posed, camera: Intrinsics) -> bool:
+    """Whether one of two frames shows enough of what the other does, from about the same place: not through a wall."""
+    metres, radians = distance(first[1], second[1])
+    if metres >= SEEN_AGAIN_M or radians >= np.radians(SEEN_AGAIN_DEG):
+        return False
+    return max(_shown(first, second, camera), _shown(second, first, camera)) >= SEEN_AGAIN
+
+
+def _shown(first: Posed, second: Posed, camera: Intrinsics) -> float:
+    """Share of what the first frame measured that the second measured too, at its true pose."""
+    (depth, T_world_first), (other, T_world_second) = first, second
+    v, u = np.nonzero(depth)
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
+    T = inverse(T_world_second) @ T_world_first
+    x, y, z = (ray * depth[v, u][:, None] @ T[:3, :3].T + T[:3, 3]).T
+    z = np.where(z > 0, z, np.inf)
+    u, v = np.rint(camera.fx * x / z + camera.cx), np.rint(camera.fy * y / z + camera.cy)
+    inside = np.isfinite(z) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    measured = other[v[inside].astype(int), u[inside].astype(int)]
+    same = (measured > 0) & (np.abs(measured - z[inside]) < SAME_M + SAME * measured)
+    return float(same.sum() / max(len(z), 1))
 
 
 def _rightly(state: SlamState, j: int, k: int, true: np.ndarray) -> bool:

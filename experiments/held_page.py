@@ -1,19 +1,17 @@
-"""`docs/held.md`, `docs/held.png` and the README's table, from `docs/held.csv`, which `held.py` writes.
+"""`docs/held.md` and the README's table, from `docs/held.csv`, which `held.py` writes, with some of its plans.
 
-    python experiments/held_page.py
-
-The picture is drawn anew where the poses of its runs were made.
+python experiments/held_page.py
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from common import OUT, ROOT, code, read_rows, table
-from held import RESULTS, Task, plan, short, stem
+from held import RESULTS, Task, short, stem
 
 README_MARKS = "<!-- held_page.py -->", "<!-- end -->"
 """The README's table is between these two lines."""
@@ -36,7 +34,7 @@ PLANS = (
     Task("large", "bookstore"),
     *(Task("homes", f"synth:home-{seed}-fast+noise+blur") for seed in (2, 4, 6)),
 )
-"""Runs whose paths are drawn, in one picture."""
+"""Runs whose paths are shown."""
 COLUMNS = {
     "sequence": "sequence",
     "stride": "every",
@@ -73,7 +71,6 @@ it, which `python experiments/held.py` writes, by `python experiments/held_page.
 docstring of the former. Default preset, each run held to one core. `code` is a digest of the program. This page was
 made by {code}: rows of others are of earlier programs.
 """
-PICTURE = "![True and estimated paths from above](held.png)\n"
 
 
 def overview(rows: list[dict[str, str]], columns: tuple[str, ...] = ()) -> str:
@@ -137,8 +134,9 @@ def _kind(row: Mapping[str, str]) -> str:
 def write_page(rows: list[dict[str, str]]) -> None:
     """All runs, group by group, each after its overview."""
     parts = [PAGE.format(code=code())]
-    if (RESULTS / "held.png").exists():
-        parts.append(PICTURE)
+    shown = [task for task in PLANS if (RESULTS / f"{stem(task)}.png").exists()]
+    parts += [f"![True and estimated path, {short(task.name)}]({stem(task)}.png)" for task in shown]
+    parts.append("")
     for group in dict.fromkeys(row["group"] for row in rows):
         runs = [row for row in rows if row["group"] == group]
         titles = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in runs)}
@@ -156,26 +154,17 @@ def write_readme(rows: list[dict[str, str]]) -> None:
     readme.write_text(f"{before}{README_MARKS[0]}\n\n{shown}\n\n{README_MARKS[1]}{after}")
 
 
-def draw_plans() -> None:
-    """`docs/held.png`: true and estimated paths, each with the code that made it. An older picture stays where not all
-    poses for it were made here."""
-    paths = [OUT / f"{stem(task)}.npz" for task in PLANS]
-    if not all(path.exists() for path in paths):
-        return
-    figure, axes = plt.subplots(2, 2, figsize=(10, 10))
-    for task, path, ax in zip(PLANS, paths, axes.flat, strict=True):
-        with np.load(path) as kept:
-            plan(ax, kept["poses"], kept["true"])
-            ax.set_title(f"{short(task.name)} ({kept['code']})", fontsize=10)
-    axes[0, 0].legend()
-    figure.tight_layout()
-    figure.savefig(RESULTS / "held.png", dpi=80)
-    plt.close(figure)
+def take_plans() -> None:
+    """Copies the plans that are shown from where `held.py` draws them. Older ones stay where there are none."""
+    for task in PLANS:
+        plan = OUT / f"{stem(task)}.png"
+        if plan.exists():
+            shutil.copy(plan, RESULTS)
 
 
 def main() -> None:
     rows = read_rows("held", RESULTS)
-    draw_plans()
+    take_plans()
     write_page(rows)
     write_readme(rows)
 
