@@ -9,10 +9,10 @@ out unless `--again`. `held_page.py` makes a page of the CSV.
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, on which
 nobody tuned, slow and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is
-not; `rooms` and `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera; `wrong-
-depth`, depth that is not what a sequence says, measured along the ray or in whole metres, of which a run must say so;
-`colour`, colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after the last
-frame.
+not; `rooms` and `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera;
+`wrong-depth`, depth that is not what a sequence says, measured along the ray or in whole metres, of which a run must
+say so; `colour`, colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after
+the last frame.
 
 A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
 hides. A true loop is a pair of submaps, far along the chain, in which the camera saw the same: three tenths of what a
@@ -60,7 +60,7 @@ SLIDE_FRAMES = 12
 CHANGE_FRAMES = 15
 """Frames after and before a change of submap that count as near it."""
 SEEN_AGAIN_M, SEEN_AGAIN_DEG, SEEN_AGAIN = 1.0, 30.0, 0.3
-"""How near to an earlier frame another must be, and the share of what it measured that it must show."""
+"""How near one frame must be to another, and the share of what one of both measured that the other must show."""
 SAME_M, SAME = 0.05, 0.02
 """Metres, and share of the depth, by which two measurements of one surface may differ."""
 JOINED_M = 0.1

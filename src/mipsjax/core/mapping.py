@@ -264,7 +264,7 @@ def _share_of_loss(
 ) -> Float[Array, ""]:
     """What a batch adds to the loss of the whole draw."""
     if not cfg.map.pose_learning_rate:
-        # Derivatives by poses take an eighth of a step's time; the loss is the same without them
+        # Derivatives by poses take time, and nothing asks for them; the loss is the same
         twist = jax.lax.stop_gradient(twist)
     points = _points(moved(frames, twist), batch.frame, batch.pixels, batch.samples.depth)
     total, finest = jnp.zeros(()), None
