@@ -257,3 +257,14 @@ def test_the_gradient_of_the_distance_is_numerical():
         rise = (psi(POINTS + shift) - psi(POINTS - shift)) / (2 * step)
         # A ReLU that switches between the two points spoils a few; psi itself is rounded to 1e-8
         assert np.quantile(np.abs(gradient[:, axis] - rise), 0.95) < 2e-4
+
+
+@pytest.mark.parametrize("feature", range(SMALL.hash_features))
+def test_the_gradient_of_the_table_is_the_transpose_of_reading_it(feature):
+    # Many points to an entry, and another weight for every feature of each
+    weight = np.random.default_rng(5).normal(size=(len(POINTS), SMALL.hash_levels * SMALL.hash_features))
+    table, change = random_table(SMALL), np.zeros_like(random_table(SMALL))
+    change[..., feature] = np.random.default_rng(6).normal(size=change.shape[:2])
+    gradient = jax.grad(lambda t: jnp.sum(weight * nf.hash_features(t, POINTS, SMALL)))(table)
+    read = weight * nf.hash_features(change, POINTS, SMALL)
+    np.testing.assert_allclose(np.sum(gradient * change), np.sum(read), rtol=1e-4, atol=1e-3)

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from mipsjax.config import FieldConfig
 
@@ -193,9 +193,31 @@ def hash_features(
             for z in (lo[2], hi[2])
         ]
     )
-    flat = table.reshape(levels * entries, features)
-    encoded = [_trilinear(flat[:, f][index], offset) for f in range(features)]
-    return jnp.concatenate(encoded).T
+    corners = _picked(table.reshape(levels * entries, features), index)
+    return jnp.concatenate([_trilinear(feature, offset) for feature in corners]).T
+
+
+@jax.custom_vjp
+def _picked(flat: Float[Array, "E F"], index: Int[Array, "8 L N"]) -> list[Float[Array, "8 L N"]]:
+    """Entries of a table, an array for every feature.
+
+    The derivative by the table is one scatter of whole entries: the same bits as from one for every feature, in a
+    fraction of the time on a CPU.
+    """
+    return [flat[:, f][index] for f in range(flat.shape[1])]
+
+
+def _picked_forward(flat, index):
+    return _picked(flat, index), (flat, index)
+
+
+def _picked_backward(residuals, by_feature):
+    flat, index = residuals  # of the first, the shape alone
+    rows = jnp.stack(by_feature, -1).reshape(-1, flat.shape[1])
+    return jnp.zeros_like(flat).at[index.reshape(-1)].add(rows, mode="promise_in_bounds"), None
+
+
+_picked.defvjp(_picked_forward, _picked_backward)
 
 
 def _trilinear(corners: Float[Array, "8 L N"], offset: Float[Array, "3 L N"]) -> Float[Array, "L N"]:
