@@ -66,10 +66,10 @@ COLUMNS = {
 }
 PAGE = """# Held everywhere
 
-What holds the camera on recordings and in drawn homes; nobody tuned on the group `homes`. Made from `held.csv` beside
-it, which `python experiments/held.py` writes, by `python experiments/held_page.py`; what the columns mean is in the
-docstring of the former. Default preset, each run held to one core. `code` is a digest of the program. This page was
-made by {code}: rows of others are of earlier programs.
+What holds the camera on recordings and in drawn homes; nobody tuned on the group `homes`. What the columns mean is in
+the docstring of `experiments/held.py`, which writes `held.csv`; `experiments/held_page.py` makes this page from it. Default
+preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program. This page was made by
+{code}: rows of others are of earlier programs.
 """
 
 

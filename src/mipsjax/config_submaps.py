@@ -53,7 +53,8 @@ class LoopConfig:
     """Loops between submaps, and finding a lost camera again."""
 
     enabled: bool = True
-    """Off: submaps stay where they were begun (the paper's ablation "No LC")."""
+    """Off: no loop is closed as the run goes (the paper's ablation "No LC"); `pairs` still move submaps after the last
+    frame."""
     relocalise: bool = True
     """A lost camera is looked for in all submaps; not in the paper."""
     patience: int = 60

@@ -57,6 +57,7 @@ class RefineConfig:
     """For the choice among the candidates of the motion prior, and for steps on the smooth field where there is one
     besides the fine one: before the others, where those alone have not converged."""
     smooth_steps: int = 7
+    """On the smooth field."""
     final_steps: int = 4
     """Of a last alignment of every frame to the finished map, with `lm`; 0 is none, as in the paper."""
     learning_rate: float = 1e-2
@@ -187,6 +188,7 @@ class TrackConfig:
     """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only
     along a direction that nothing else holds, with `lm`."""
     rest: float = 0.9
-    """A frame starts from no motion only where its residual on the smooth field is below this part of that at constant
-    velocity; 1 takes whichever is less, 0 never rest. A camera that surfaces hardly hold fits almost alike at rest, and
-    would be left there. After a gap of more than five intervals between frames it is the other way round."""
+    """A frame starts from constant velocity instead of the motion that its corners show, or without corners from no motion
+    instead of constant velocity, only where its residual on the smooth field is there below this part of the other's; 1
+    takes whichever is less, 0 always the first. A camera that surfaces hardly hold fits almost alike at rest, and would
+    be left there. After a gap of more than five intervals between frames no motion stands for constant velocity."""
