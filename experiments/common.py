@@ -35,6 +35,8 @@ EARLY = 200  # frames after which memory is noted, to be compared with the end
 
 class Run(NamedTuple):
     state: SlamState
+    online: SlamState
+    """As it was after the last frame, before the adjustment that follows."""
     sequence: Sequence
     row: dict[str, Any]
 
@@ -79,7 +81,7 @@ def run(
         f"peak_{EARLY}_mb": early,
         "peak_online_mb": loop_peak,
     }
-    return Run(state, sequence, row | figures(state, sequence) | speed)
+    return Run(state, online, sequence, row | figures(state, sequence) | speed)
 
 
 class Altered:
@@ -192,7 +194,10 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def code(source: Path = ROOT / "src") -> str:
-    """What tells programs apart: a digest of all of `src/` without its comments and docstrings."""
+    """What tells programs apart: a digest of all of `src/` without its comments and docstrings.
+
+    Of one version of Python: each writes down the syntax in its own way.
+    """
     digest = hashlib.sha256()
     for path in sorted(source.rglob("*.py")):
         tree = ast.parse(path.read_text())

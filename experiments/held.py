@@ -14,12 +14,14 @@ not; `rooms` and `kitchen`, earlier figures; `blind`, images made flat, so that 
 say so; `colour`, colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after
 the last frame.
 
-A slide is the error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory
-hides. A true loop is a pair of submaps, far along the chain, in which the camera saw the same: three tenths of what a
-keyframe of one measured, in a keyframe of the other, less than a metre and 30 degrees apart. It is found if the pair is
-joined in the end, within 10 cm of the truth; a pair joined otherwise is false. Accuracy is the mean distance of the
-mesh to the surface that was seen, where a recording comes with it, without what is farther off than 20 cm, and
-completion the share of that surface within 5 cm of the mesh; no mesh is aligned.
+Errors are of the trajectory as it is written; those of columns that begin with `online` are of that before the
+adjustment that follows the last frame. Statuses and stated deviations were given as each frame came. A slide is the
+error of the motion over 12 frames, which no residual shows and which alignment of the whole trajectory hides. A true
+loop is a pair of submaps, far along the chain, in which the camera saw the same: three tenths of what a keyframe of one
+measured, in a keyframe of the other, less than a metre and 30 degrees apart. It is found if the pair is joined in the
+end, within 10 cm of the truth; a pair joined otherwise is false. Accuracy is the mean distance of the mesh to the
+surface that was seen, where a recording comes with it, without what is farther off than 20 cm, and completion the share
+of that surface within 5 cm of the mesh; no mesh is aligned.
 """
 
 from __future__ import annotations
@@ -91,7 +93,7 @@ def homes(seeds: Iterable[int], group: str) -> list[Task]:
 
 
 def tasks(group: str, seeds: list[int]) -> list[Task]:
-    """The runs of a group; of homes, with the first seed alone."""
+    """The runs of a group; of homes, with seed 0 alone."""
     large = ("bookstore", "corridor_walk")
     if group == "large":
         return [Task(group, name, seed=seed) for name, seed in product(large, seeds)]
@@ -171,6 +173,7 @@ def configuration(switch: str) -> Config:
 
 def done(task: Task) -> dict[str, Any]:
     """The row of one run."""
+    row = task._asdict() | {"code": code()}  # of what is running: `src/` may change before it ends
     enable_cache()
     path = task.name if ":" in task.name else str(DATA / task.name)
     cfg = configuration(task.switch)
@@ -180,15 +183,17 @@ def done(task: Task) -> dict[str, Any]:
         return seen if altered is None else Altered(seen, altered)
 
     found = run(path, cfg, frames=frames, seed=task.seed, see=see)
-    row = task._asdict() | found.row | {"sequence": short(task.name)}
+    row |= found.row | {"sequence": short(task.name)}
     agreement = judged(found.state, cfg)
     row["looked_through"] = float("nan") if agreement is None else agreement.worst.share
     row["contradicted"] = agreement is not None and agreement.begins is not None
     true = found.sequence.T_world_cam
     if true is not None and np.isfinite(true).all():
-        row |= slides(found) | wrong(found) | stated(found.state, found) | near_changes(found)
+        row |= slides(found) | near_changes(found) | wrong(found.state, true) | stated(found.state, true)
+        online = wrong(found.online, true) | stated(found.online, true)
+        row |= {f"online_{key}": value for key, value in online.items()}
         mesh = reconstruct(found.state, cfg)
-        row |= loops(found.state, found, cfg) | surface(mesh, Path(path) / "observed.npz")
+        row |= loops(found, cfg) | surface(mesh, Path(path) / "observed.npz")
         keep(found, mesh, OUT / stem(task))
     return row
 
@@ -265,25 +270,25 @@ def slides(found: Run) -> dict[str, Any]:
 
 
 def motion_errors(found: Run, frames: int) -> np.ndarray:
-    """Metres and radians by which the motion over so many frames is wrong, N x 2."""
+    """Metres and radians by which the motion over so many frames, or over all of a shorter run, is wrong, N x 2."""
     poses, true = trajectory(found.state), found.sequence.T_world_cam
-    errors = []
+    frames, errors = min(frames, len(poses) - 1), []
     for begin in range(len(poses) - frames):
         moved, truly = (inverse(T[begin]) @ T[begin + frames] for T in (poses, true))
         errors.append(distance(truly, moved))
     return np.array(errors)
 
 
-def wrong(found: Run) -> dict[str, Any]:
+def wrong(state: SlamState, true: np.ndarray) -> dict[str, Any]:
     """Frames that are `ok` and yet far off. The first frame was given its true pose; nothing is aligned."""
-    off = np.linalg.norm(trajectory(found.state)[:, :3, 3] - found.sequence.T_world_cam[:, :3, 3], axis=1)
-    ok = np.array([record.status is Status.OK for record in found.state.records])
+    off = np.linalg.norm(trajectory(state)[:, :3, 3] - true[:, :3, 3], axis=1)
+    ok = np.array([record.status is Status.OK for record in state.records])
     return {"wrong_ok": int(np.sum(ok & (off > OFF_M))), "off_max_cm": 100 * float(off.max())}
 
 
-def stated(state: SlamState, found: Run) -> dict[str, Any]:
+def stated(state: SlamState, true: np.ndarray) -> dict[str, Any]:
     """Share of frames whose error in their submap is within three times the stated deviation; anchors have none."""
-    true, within = found.sequence.T_world_cam, []
+    within = []
     for place, record in enumerate(state.records):
         deviation, _ = deviations_of(state, record)
         if deviation > 0:
@@ -306,9 +311,10 @@ def near_changes(found: Run) -> dict[str, Any]:
     return {name: 1000 * float(np.median(metres[chosen])) for name, chosen in middle.items()}
 
 
-def loops(state: SlamState, found: Run, cfg: Config) -> dict[str, Any]:
+def loops(found: Run, cfg: Config) -> dict[str, Any]:
     """True loops, those of them that were found, and false ones that were kept."""
-    true, joined = found.sequence.T_world_cam, set(linked_pairs(state))
+    state, true = found.state, found.sequence.T_world_cam
+    joined = set(linked_pairs(state))
     away = [chain_distances(state, place) for place in range(len(state.submaps))]
     camera = mapping_camera(state.camera, cfg)
     own = [
@@ -391,7 +397,7 @@ def all_of(wanted: list[Task], workers: int, again: bool) -> None:
 
     with ThreadPoolExecutor(workers) as pool:
         for ended in as_completed([pool.submit(work, task) for task in wanted]):
-            row = ended.result() | {"code": now}
+            row = {"code": now} | ended.result()
             rows[_key(row)] = row
             show(row)
             write_rows("held", rows.values(), RESULTS)

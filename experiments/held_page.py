@@ -48,7 +48,9 @@ COLUMNS = {
     "weak": "weak",
     "lost": "lost",
     "wrong_ok": "ok and over 30 cm off",
+    "online_wrong_ok": "ok and over 30 cm off online",
     "within_3_deviations": "within 3 deviations",
+    "online_within_3_deviations": "within 3 deviations online",
     "looked_through": "looked through",
     "contradicted": "depth contradicts itself",
     "submaps": "submaps",
@@ -67,9 +69,9 @@ COLUMNS = {
 PAGE = """# Held everywhere
 
 What holds the camera on recordings and in drawn homes; nobody tuned on the group `homes`. What the columns mean is in
-the docstring of `experiments/held.py`, which writes `held.csv`; `experiments/held_page.py` makes this page from it. Default
-preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program. This page was made by
-{code}: rows of others are of earlier programs.
+the docstring of `experiments/held.py`, which writes `held.csv`; `experiments/held_page.py` makes this page from it.
+Default preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program. This
+page was made by {code}: rows of others are of earlier programs.
 """
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import jax
 import numpy as np
 import pytest
 
+from mipsjax import straighten
 from mipsjax.bundle import make_keyframe
 from mipsjax.config import Config, PairConfig
 from mipsjax.config_tracking import BrightnessConfig, CornerConfig, TrackConfig
 from mipsjax.core.mapping import Learned
 from mipsjax.core.volume import Box
 from mipsjax.data.sequence import Frame
+from mipsjax.host.trust import ALLOWED_TRACKED, Differing, trusted
 from mipsjax.landmarks import corners_of
 from mipsjax.policy import Status
 from mipsjax.state import (
@@ -184,6 +187,29 @@ def test_keyframes_that_are_measured_once_stay_as_tracked():
     first = state.submaps[0]._replace(keyframes=state.submaps[0].keyframes[:2])
     few = state._replace(submaps=(first,), records=state.records[:2], active=0)
     assert straightened(few, CFG) == (few, 1.0)
+
+
+def test_pairs_that_say_nothing_of_colour_leave_the_trust_that_tracking_found(monkeypatch):
+    monkeypatch.setattr(straighten, "of_pair", lambda *_: None)
+    differing = Differing(np.full(6, 100.0), np.ones(6))
+    state = travelled(drifted())._replace(doubts=(differing,) * 20)
+    assert straightened(state, CFG)[1] == trusted(state.doubts, ALLOWED_TRACKED) < 0.1
+
+
+@pytest.mark.parametrize("worst", [-1e-4, 0.0, np.nan])
+def test_a_pair_that_rounding_leaves_without_a_covariance_is_left_out(worst, monkeypatch):
+    real = straighten.relative.measure
+
+    def measure(*arguments):
+        found = jax.device_get(real(*arguments))
+        surfaces, colour = np.array(found.surfaces), np.zeros_like(found.colour)
+        surfaces[0] = np.diag([worst, 1e3, 1e3, 1e3, 1e3, 1e3])
+        surfaces[1:] += found.colour[1:]
+        return found._replace(surfaces=surfaces, colour=colour)
+
+    monkeypatch.setattr(straighten.relative, "measure", measure)
+    moved, _ = straightened(travelled(drifted()), CFG)
+    assert all(np.isfinite(world_pose(moved, record)).all() for record in moved.records)
 
 
 def test_a_keyframe_that_sees_nothing_of_the_others_stays_beside_the_one_before():

@@ -228,9 +228,9 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
         given.append(state)
         return state, 0.25
 
-    def align(field, depth, T, corners, *others):
-        firm.append(corners)
-        return real(field, depth, T, corners, *others)
+    def align(field, depth, T, colour, *others):
+        firm.append(colour)
+        return real(field, depth, T, colour, *others)
 
     monkeypatch.setattr(final, "closed_again", closed_again)
     monkeypatch.setattr(final, "straightened", straightened)
@@ -247,6 +247,7 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
     assert (poses[2] != poses[0]).any()
     # Colour holds a frame there as far as it was found right
     held = np.stack([r.colour for r in before.records if r.submap == 0 and r.depth is not None])
+    assert held.any()
     np.testing.assert_allclose(firm[0][: len(held)], 0.25 * held[: len(firm[0])], rtol=1e-6)
 
 

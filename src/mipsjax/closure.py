@@ -135,9 +135,9 @@ def _looked_up(state: SlamState, cfg: Config) -> tuple[SlamState, list[Found]]:
     """All keyframes, by their images, in submaps far away that theirs is not linked with yet.
 
     What they were looked for in while the camera moved had fewer keyframes then, and had learned less. Of a pair of
-    submaps only the first few are linked: they say how the two lie.
+    submaps only the first few are linked, each found without the others: they say how the two lie.
     """
-    linked, found = set(linked_pairs(state)), list[Found]()
+    before, linked, found = state, set(linked_pairs(state)), list[Found]()
     for active, submap in enumerate(state.submaps):
         far = [p for p, n in enumerate(chain_distances(state, active)) if n >= cfg.loop.apart]
         own = [
@@ -148,7 +148,8 @@ def _looked_up(state: SlamState, cfg: Config) -> tuple[SlamState, list[Found]]:
             places = [
                 p for p in far if _pair(active, p) not in linked and known.count(_pair(active, p)) < LOOKED_UP
             ]
-            sighting = recognise(state, keyframe, places, cfg)
+            # A keyframe that was linked a moment ago looks like this one, and would draw it to the same place
+            sighting = recognise(before, keyframe, places, cfg)
             if sighting is not None:
                 state = link(state, keyframe, sighting)
                 found.append(Found(keyframe.number, active, sighting, "features"))

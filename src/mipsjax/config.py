@@ -177,9 +177,10 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class PairConfig:
-    """Keyframes measured against each other after the last frame, by corners and depth images of both and by no map:
-    what says that a submap has turned or bent within itself. Only where `map.final_steps` learn the map there; not at
-    all where `before`, `others` and `oldest` are 0. Not in the paper."""
+    """Keyframes measured against each other after the last frame, by corners, brightness and depth images of both and
+    by no map: what says that a submap has turned or bent within itself. Only where `map.final_steps` learn the map
+    there, and where two pairs for each keyframe lie near enough; not at all where `before`, `others` and `oldest` are
+    0. Not in the paper."""
 
     before: int = 3
     """Keyframes just before each one that it is measured against."""

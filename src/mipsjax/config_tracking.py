@@ -82,8 +82,8 @@ class RefineConfig:
     view_rotation: float = 0.5
     """Radians, the same."""
     known: int = 8
-    """Keyframes nearest to the expected pose: the steps trust the field only where these observed something, since
-    elsewhere it is certain of surfaces that it made up. 0: everywhere, as in the paper."""
+    """Keyframes nearest to the expected pose: points count in the steps only where these observed something, since
+    elsewhere the field is certain of surfaces that it made up. 0: everywhere, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,8 @@ class TrackConfig:
     """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only
     along a direction that nothing else holds, with `lm`."""
     rest: float = 0.9
-    """A frame starts from constant velocity instead of the motion that its corners show, or without corners from no motion
-    instead of constant velocity, only where its residual on the smooth field is there below this part of the other's; 1
-    takes whichever is less, 0 always the first. A camera that surfaces hardly hold fits almost alike at rest, and would
-    be left there. After a gap of more than five intervals between frames no motion stands for constant velocity."""
+    """A frame starts from constant velocity instead of the motion that its corners show, or without corners from no
+    motion instead of constant velocity, only where its residual on the smooth field is there below this part of the
+    other's; 1 takes whichever is less, 0 always the first. A camera that surfaces hardly hold fits almost alike at
+    rest, and would be left there. After a gap of more than five intervals between frames no motion stands for constant
+    velocity."""

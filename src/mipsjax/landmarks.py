@@ -69,7 +69,7 @@ def _pose(state: SlamState, reference: Corners, cfg: Config) -> Pose | None:
     other = state.submaps[record.submap]
     if state.submap.parent != record.submap and other.parent != active:
         return None
-    # By the frame with which one was begun: the pose graph moves submaps, not what they have learned
+    # By the shared frame that is nearest to both anchors: the pose graph moves submaps, not what they have learned
     between = best_link(state.submap, other, True, cfg)
     return None if between is None else between.T_first_second @ pose_of(state, record)
 

@@ -94,7 +94,8 @@ class Refinement(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Between the last two trusted frames."""
+    """Between the last two trusted frames, as it is expected to go on: along what measurements leave loose, partly that
+    of before."""
 
     T_older_newer: Pose
     """Camera to camera."""
@@ -102,7 +103,7 @@ class Motion(NamedTuple):
 
 
 class FrameInfo(NamedTuple):
-    """For the reader of `status.csv`; nothing depends on it."""
+    """For the reader of `status.csv`; of it only `keyframe` decides anything."""
 
     residual_before: float = float("nan")
     """Metres."""
@@ -168,7 +169,8 @@ class SlamState(NamedTuple):
     refinement: Refinement | None = None
     """Under way."""
     corners: tuple[Corners, ...] = ()
-    """Of the last trusted frame, then of keyframes before it: the newest, and the oldest that are still seen."""
+    """Of the last frame that was tracked with colour and taught the map, then of keyframes before it: the newest, and
+    the oldest that are still seen."""
     doubts: tuple[Differing, ...] = ()
     """How colour and surfaces of frames of late differ, by which colour is trusted."""
     residual: float = 0.0

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import ArrayLike
 
 from mipsjax.bundle import nearest
 from mipsjax.config import Config
@@ -34,7 +35,7 @@ log = logging.getLogger(__name__)
 GROUP = 16
 """Pairs that are measured in one call."""
 AGREEING = 2
-"""Pairs for each keyframe, at least: measured once, it is known no better than as it was tracked."""
+"""Pairs that lie near, for each keyframe, at least: measured once, it is known no better than as it was tracked."""
 SIGMA_M, SIGMA_RAD = 0.001, 0.0005
 """Of a measured pair, beside what it states: two images of one place err together."""
 
@@ -61,17 +62,19 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     """With keyframes where they lie by each other, the first one as it was; submaps move with their anchors, and frames
     with the keyframes that they hang on. Also the trust in colour that was found right.
 
-    Submaps that nothing joins to the first stay where they are, and so does all of a run of a few keyframes.
+    Submaps that nothing joins to the first stay where they are, and so does all of a run of which few keyframes lie
+    near others.
     """
     nodes = _keyframes(state)
     numbers = [node.keyframe.number for node in nodes]
     poses = np.stack([node.T_world_cam for node in nodes])
-    pairs = [_followed(nodes, *places, state, cfg) for places in _near(poses, cfg)]
-    if len(pairs) < AGREEING * len(nodes):
-        return state, trusted(state.doubts, ALLOWED_TRACKED)
+    near, trust = list(_near(poses, cfg)), trusted(state.doubts, ALLOWED_TRACKED)
+    if len(near) < AGREEING * len(nodes):
+        return state, trust
+    pairs = [_followed(nodes, *places, state, cfg) for places in near]
     measured = _measured(nodes, pairs, 1.0, state, cfg)
     differences = [of_pair(measured, number) for number in range(len(pairs))]
-    trust = trusted([difference for difference in differences if difference is not None], ALLOWED)
+    trust = trusted([difference for difference in differences if difference is not None], ALLOWED, trust)
     if trust < 1:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
@@ -188,15 +191,12 @@ def _images(nodes: list[Node], pairs: list[Pair], state: SlamState, cfg: Config)
 
 def _pair_factors(pairs: list[Pair], measured: relative.Relative, cfg: Config) -> Iterator[RelativePose]:
     """Of pairs that corners or enough surfaces join."""
-    order = [3, 4, 5, 0, 1, 2]  # of a tangent: that of the graph is (rotation, translation)
     for number, pair in enumerate(pairs):
         T_first_second = np.asarray(measured.T_first_second[number])
-        information = np.asarray(measured.surfaces[number] + measured.colour[number], np.float64)
-        finite = np.isfinite(T_first_second).all() and np.isfinite(information).all()
-        if not finite or (pair.seen is None and measured.matched[number] < MATCHED):
+        added = _covariance(measured.surfaces[number] + measured.colour[number])
+        held = pair.seen is not None or measured.matched[number] >= MATCHED
+        if added is None or not held or not np.isfinite(T_first_second).all():
             continue
-        covariance = np.linalg.inv(information)
-        added = (covariance + covariance.T)[np.ix_(order, order)] / 2
         yield RelativePose(
             pair.first,
             pair.second,
@@ -206,6 +206,17 @@ def _pair_factors(pairs: list[Pair], measured: relative.Relative, cfg: Config) -
             added=added,
             cauchy=cfg.pairs.robust,
         )
+
+
+def _covariance(information: ArrayLike) -> Float64[np.ndarray, "6 6"] | None:
+    """The inverse, for a tangent (rotation, translation) as the pose graph has it; None of what has none, where the
+    rounding of single precision exceeds what little holds a pair."""
+    firm = np.asarray(information, np.float64)
+    if not np.isfinite(firm).all() or np.linalg.eigvalsh(firm)[0] <= 0:
+        return None
+    covariance, order = np.linalg.inv(firm), [3, 4, 5, 0, 1, 2]
+    covariance = (covariance + covariance.T)[np.ix_(order, order)] / 2
+    return covariance if np.linalg.eigvalsh(covariance)[0] > 0 else None
 
 
 def _as_tracked(

@@ -47,9 +47,9 @@ class FrameRow(NamedTuple):
     status: Status
     info: FrameInfo
     deviation_m: float = float("nan")
-    """Standard deviation of where the camera is in its submap."""
+    """Standard deviation of where the camera is in its submap, as tracked: before what follows the last frame."""
     deviation_deg: float = float("nan")
-    """And of how it is turned."""
+    """The same of how it is turned."""
 
 
 class Run(NamedTuple):

@@ -137,7 +137,8 @@ def sight(
 
 
 def _registered(submap: Submap, keyframe: Keyframe, guess: Pose, camera: Intrinsics, cfg: Config) -> Any:
-    """On the host. Again from where it ended while that moves it: across a loop the guess may be decimetres off."""
+    """The frame registered in the submap, on the host. It is registered again from where it ended, while that moves it:
+    across a loop the guess may be decimetres off."""
     small, depth = mapping_camera(camera, cfg), jnp.asarray(keyframe.depth)
     views = views_of(nearest(submap.keyframes, guess, VIEWS))
 

@@ -17,6 +17,7 @@ from planes import plane
 from mipsjax.core import equations, losses, solvers, tracking
 from mipsjax.core import field as nf
 from mipsjax.core.camera import transform
+from mipsjax.core.photometric import Images
 from mipsjax.core.views import Views, own_normals
 
 pytestmark = pytest.mark.slow
@@ -384,6 +385,22 @@ def test_what_no_keyframe_observed_does_not_count_in_registration(corner_map, fr
     metres, degrees = apart(TRUTH, found.T_sub_cam)
     assert metres < TOLERANCE_M and degrees < TOLERANCE_DEG
     assert 0.3 < found.overlap < 0.6 and found.inliers > 0.95
+
+
+def test_a_frame_without_colour_is_tracked_as_if_colour_were_not_wanted(corner_map, frame):
+    """By the map from the start, and not first by depth images of keyframes alone, which are 10 cm off here."""
+    depth, color = frame
+    off = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.1, 0, 0)), jnp.float32)[None]
+    starts = np.stack([TRUTH @ NEAR] * 2).astype(np.float32)
+    grey, poses = np.zeros((2, *depth.shape), np.uint8), np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    none = Images(grey, np.ones((2, *depth[::2, ::2].shape), np.float32), poses, np.zeros(2, bool))
+
+    def end(images):
+        given = corner_map.field, depth, color, starts, WIDENING, KEY, CAMERA, CFG, Views(depth[None], off)
+        return jax.device_get(tracking.track(*given, images=images))[0]
+
+    # What is left is how XLA rounds in two programs
+    np.testing.assert_allclose(end(none), end(None), atol=1e-6)
 
 
 def test_the_robust_cost():

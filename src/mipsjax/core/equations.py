@@ -21,7 +21,7 @@ from mipsjax.core import losses
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
 SETTLED = 3e-4  # metres, or rad: what a step is shorter than after which no more are tried
-FLOOR = 1e-3  # added to the 6 x 6 system, m^2 or rad^2: keeps an unobserved direction where it is
+FLOOR = 1e-3  # added to the diagonal of the 6 x 6 system: keeps an unobserved direction where it is
 
 
 class Points(NamedTuple):

@@ -202,7 +202,7 @@ def _picked(flat: Float[Array, "E F"], index: Int[Array, "8 L N"]) -> list[Float
     """Entries of a table, an array for every feature.
 
     The derivative by the table is one scatter of whole entries: the same bits as from one for every feature, in a
-    fraction of the time on a CPU.
+    fraction of the time on a CPU. It can be taken in reverse mode alone (`jax.grad`, not `jax.jvp`).
     """
     return [flat[:, f][index] for f in range(flat.shape[1])]
 

@@ -42,7 +42,7 @@ class Images(NamedTuple):
 
     grey: UInt8[Array, "K H W"]
     depth: Float[Array, "K h w"]
-    """Decimated by a whole factor; metres, 0 for no measurement."""
+    """Decimated by a whole factor; metres, 0 for no measurement. That of `Corners` has none: holes are filled."""
     T_sub_cam: Float[Array, "K 4 4"]
     mask: Bool[Array, " K"]
     """False fills up to a fixed number."""

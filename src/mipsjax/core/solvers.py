@@ -54,7 +54,8 @@ class Landmarks(NamedTuple):
 
 class Information(NamedTuple):
     """How firmly a frame is held: inverse covariances of its pose, for a twist (v, omega) in the camera's frame,
-    1/m^2 and 1/rad^2, as if each point, corner and pixel erred alone."""
+    1/m^2 and 1/rad^2, each point, corner and pixel with its weight in the steps; `track.held` says how many of them err
+    together."""
 
     surfaces: Float[Array, "6 6"]
     """By the map and the depth images of keyframes."""
@@ -63,9 +64,9 @@ class Information(NamedTuple):
     brightness: Float[Array, "6 6"]
     """By the brightness of all of it."""
     to_surfaces: Float[Array, "6"]
-    """The twist from the pose to where surfaces alone would have it."""
+    """The twist from the pose to where surfaces alone would have it; not finite where these leave something open."""
     to_colour: Float[Array, "6"]
-    """To where corners and brightness alone would; not finite where these leave something open."""
+    """To where corners and brightness alone would; the same."""
 
 
 class Evidence(NamedTuple):

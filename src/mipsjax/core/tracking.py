@@ -31,9 +31,8 @@ from mipsjax.core.solvers import (
 )
 from mipsjax.core.views import Views, observed, own_normals
 
-ENOUGH = (
-    100  # corners that say where the camera is to a pixel or two: no coarse level of images is needed then
-)
+# Corners that say where the camera is to a pixel or two: no coarse level of images is needed then
+ENOUGH = 100
 BEHIND = 0.3  # metres behind what a keyframe saw, to which its surface may still be that of a frame not yet registered
 
 
@@ -111,7 +110,7 @@ def track(
     field also align the frame to. `landmarks` are corners of earlier frames, which these steps keep where the frame
     shows them, and `images` are the same frames as they looked: where landmarks are few, it comes near by these and
     `views` before the map is asked. `trust` is what landmarks and images count for, of what they would. `known` are
-    more keyframes: the second-order steps trust the field only where these observed something.
+    more keyframes: points count in the second-order steps only where these observed something.
 
     The first candidate is the expected pose. It starts from that one, or from another whose residual on the smooth
     field is below `track.rest` times as much: where surfaces hardly hold a frame, all fit almost alike.
@@ -142,7 +141,7 @@ def track(
         return T
 
     finest = next(iter(compared(1)), None)
-    few = jnp.bool_(images is not None)
+    few = jnp.bool_(False) if images is None else jnp.any(images.mask)  # without colour the map comes first
     if landmarks is not None:
         few &= jnp.sum(landmarks.mask) < ENOUGH
 

@@ -46,8 +46,9 @@ APART = 1.0
 """Radians between two directions of view, or as many times the usual depth between two places, or their sum: what is
 farther apart hardly sees the same."""
 GRAZING = 4.0
-"""Tangent of the angle between line of sight and normal above which a surface is left out: depth along a line of sight
-then changes by more than its noise from one pixel to the next."""
+"""Relative change of depth, for a step of one focal length in the image, above which a surface is left out: depth then
+changes by more than its noise from one pixel to the next. For a surface in the middle of the image this is the tangent
+of the angle between line of sight and normal."""
 FARTHER = 1.5
 """Times the distance from which it was measured, from which a surface may be looked at: from farther away it is too
 small in the image."""

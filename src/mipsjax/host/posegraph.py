@@ -1,7 +1,7 @@
 """Poses of all submaps from measurements between them: loop closure (Eq. 22 of the paper) on GTSAM.
 
 A measurement comes from tracking, from matched features or from two fitted surfaces. An edge that repeats the
-current estimate would hold the drift where it is and must never be added.
+current estimate holds the drift where it is: none is added but where nothing else joins a pose to the others.
 
 Sigmas decide. Closing a loop shares its error out over the edges in proportion to their variances, so those of
 sequential edges have to be as large as drift really is. If they claim much less, a true loop is rejected as false.

@@ -73,11 +73,11 @@ def of_pair(measured: Relative, place: int) -> Differing | None:
     return differing(twist, np.asarray(measured.surfaces[place]), np.asarray(measured.colour[place]))
 
 
-def trusted(differences: Sequence[Differing], allowed: float) -> float:
+def trusted(differences: Sequence[Differing], allowed: float, otherwise: float = 1.0) -> float:
     """The most trust with which half of the differences contradict no more than is allowed, the least that is tried
-    where none will do; all of it for too few."""
+    where none will do; `otherwise` for too few."""
     if len(differences) < FEWEST:
-        return 1.0
+        return otherwise
     together = Differing(*(np.stack(parts) for parts in zip(*differences, strict=True)))
     usual = np.median(together.contradiction(STEPS[:, None, None]), -1)
     enough = np.flatnonzero(usual <= allowed)
