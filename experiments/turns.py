@@ -1,0 +1,114 @@
+"""What a change costs: two checkouts on one sequence, a few frames of each in turn.
+
+    python experiments/turns.py BEFORE AFTER SEQUENCE [--frames 400] [--block 4]
+
+BEFORE and AFTER are folders of checkouts. Each works in a process of its own, which waits while the other one works, so
+that a machine whose speed changes from minute to minute is as fast for both. Default preset; the first frames, in which
+programs are compiled, are left out, and so is what follows the last frame. Writes `turns.csv`, milliseconds a frame for
+each block, and prints what both take in the mean and how the frames a second of AFTER relate to those of BEFORE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+WARM_UP = 12
+"""Frames that are not counted."""
+READY = "ready"
+NAMES = ("before", "after")
+
+
+def work(sequence: str, frames: int, block: int) -> None:
+    """One checkout: waits for a line of input before each block, and answers with milliseconds a frame."""
+    import mipsjax  # of the checkout on PYTHONPATH
+
+    cfg = mipsjax.preset("default")
+    images = mipsjax.open_sequence(sequence, frames=slice(0, frames))
+    given = [images[place] for place in range(len(images))]
+    state = mipsjax.start(given[0], images.intrinsics, cfg)
+    for frame in given[1:WARM_UP]:
+        state = mipsjax.step(state, frame, cfg)
+    print(READY, len(given), flush=True)
+    for begin in range(WARM_UP, len(given), block):
+        sys.stdin.readline()
+        some, began = given[begin : begin + block], time.perf_counter()
+        for frame in some:
+            state = mipsjax.step(state, frame, cfg)
+        print(1e3 * (time.perf_counter() - began) / len(some), flush=True)
+
+
+def worker(checkout: Path, sequence: str, frames: int, block: int) -> subprocess.Popen[str]:
+    """The process of a checkout, of which `work` has not begun to count."""
+    command = [sys.executable, __file__, "--worker", sequence, "--frames", str(frames), "--block", str(block)]
+    environment = os.environ | {"PYTHONPATH": str(checkout.resolve() / "src")}
+    return subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+def answer(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise SystemExit(f"a checkout ended early, with exit code {process.wait()}")
+    return line
+
+
+def measured(processes: list[subprocess.Popen[str]], block: int) -> np.ndarray:
+    """Milliseconds a frame of each block, blocks x 2. Which one goes first alternates."""
+    counts = {int(answer(process).split()[1]) for process in processes}
+    assert len(counts) == 1, "both read the same frames"
+    rows = []
+    for number in range(-(-(counts.pop() - WARM_UP) // block)):
+        row = [0.0, 0.0]
+        for which in (0, 1) if number % 2 else (1, 0):
+            pipe = processes[which].stdin
+            assert pipe is not None
+            print("go", file=pipe, flush=True)
+            row[which] = float(answer(processes[which]))
+        rows.append(row)
+    return np.array(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("before", type=Path, nargs="?")
+    parser.add_argument("after", type=Path, nargs="?")
+    parser.add_argument("sequence", nargs="?")
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--block", type=int, default=4)
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.worker:
+        work(options.worker, options.frames, options.block)
+        return
+    if options.sequence is None:
+        parser.error("give two checkouts and a sequence")
+    from common import write_rows
+
+    processes = [
+        worker(checkout, options.sequence, options.frames, options.block)
+        for checkout in (options.before, options.after)
+    ]
+    found = measured(processes, options.block)
+    write_rows("turns", [dict(zip(NAMES, row, strict=True)) for row in found.tolist()])
+    for name, column in zip(NAMES, found.T, strict=True):
+        print(f"{name}: {column.mean():.1f} ms a frame in the mean, {np.median(column):.1f} in the median")
+    before, after = found.T
+    print(
+        f"frames a second: {before.mean() / after.mean():.3f} of before by the means, "
+        f"{np.median(before / after):.3f} in the median of {len(found)} blocks"
+    )
+
+
+if __name__ == "__main__":
+    main()
