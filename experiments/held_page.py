@@ -68,12 +68,12 @@ COLUMNS = {
 }
 PAGE = """# Held everywhere
 
-What holds the camera on recordings and in drawn homes; nobody tuned on the group `homes`. What the columns mean is in
-the docstring of `experiments/held.py`, which writes `held.csv`; `experiments/held_page.py` makes this page from it.
-Default preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program. This
-page was made by {code}: rows of others are of earlier programs. Of these, 044e787a and 532eced2 give the same poses as
-7660c8ec to the bit, as home 9, slow and fast, and `corridor_walk` did that were run with two of them, but where a pair
-of submaps is looked up more than once after the last frame; runs with such a pair are made again.
+What holds the camera on recordings and in drawn homes. Nobody tuned on the group `homes`; all others were used in tuning,
+and are no evidence for other scenes. What the columns mean is in the docstring of `experiments/held.py`, which writes
+`held.csv`; `experiments/held_page.py` makes this page from it. Default preset, each run held to one core. `lost` counts
+skipped frames too. `code` is a digest of the program. This page was made by {code}: rows of others are of earlier
+programs, and stand until they are made again. They differ from it where a pair of submaps is looked up more than once
+after the last frame.
 """
 
 
