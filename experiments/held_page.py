@@ -71,9 +71,7 @@ PAGE = """# Held everywhere
 What holds the camera on recordings and in drawn homes. Nobody tuned on the group `homes`; all others were used in
 tuning, and are no evidence for other scenes. What the columns mean is in the docstring of `experiments/held.py`,
 which writes `held.csv`; `experiments/held_page.py` makes this page from it. Default preset, each run held to one
-core. `lost` counts skipped frames too. `code` is a digest of the program. This page was made by {code}: rows of
-others are of earlier programs, and stand until they are made again. They differ from it where a pair of submaps is
-looked up more than once after the last frame.
+core. `lost` counts skipped frames too. `code` is a digest of the program; this page was made by {code}.
 """
 
 
