@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from flops import matrix_flops
-from mipsjax.config import Config
+from mipsjax.config.presets import PRESETS
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core import mapping, particles, tracking
 from mipsjax.core.camera import Intrinsics, grid_shape
+from mipsjax.core.encodings import fields
 from mipsjax.core.views import Views
-from mipsjax.presets import PRESETS
 
 CAMERA = Intrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 KEY = jax.random.key(0)
@@ -92,7 +93,7 @@ def test_track(throughput, name):
 
     searched = bool(run(*args)[1].searched)
     points = go.steps * pixels_of(go.pixels, CAMERA)
-    if go.method == "lm" and cfg.field.encoding == "both":
+    if go.method == "lm" and fields(cfg.field).two:
         points += go.smooth_steps * pixels_of(go.smooth_pixels, CAMERA)
     points += searched * ro.steps * ro.particles * pixels_of(ro.pixels, CAMERA)
     throughput(points, matrix_flops(run, *args, searched=searched), run, *args)

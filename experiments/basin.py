@@ -12,17 +12,16 @@ import argparse
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 
 from common import changed, show, write_rows
-from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.core import mapping, tracking
+from mipsjax.core.rigid import distance, exp
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
-from mipsjax.state import distance
+from mipsjax.submaps.bundle import MAP, adjust, make_keyframe, random_key
 
 OFFSET_M, OFFSET_RAD = 0.3, np.radians(30)
 DONE_M, DONE_RAD = 0.01, np.radians(0.5)
@@ -61,9 +60,7 @@ def share(
 ) -> float:
     done = 0
     for number, (frame, twist) in enumerate(starts(count, len(sequence), cfg.seed)):
-        start = truth[frame] @ np.asarray(
-            jaxlie.SE3.exp(jnp.asarray(twist, jnp.float32)).as_matrix(), np.float64
-        )
+        start = truth[frame] @ np.asarray(exp(jnp.asarray(twist, jnp.float32)), np.float64)
         image = sequence[frame]
         T, _ = tracking.track(
             submap.field,

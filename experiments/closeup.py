@@ -4,7 +4,7 @@
         --low -2 -2 -2 --high 3 2 4 [--azimuth 0] [--elevation 55] [--out closeup]
 
 `--low` and `--high` are opposite corners of what is shown, metres, in the frame of the meshes (y down). Faces seen from
-behind are left out, as in `host/picture.py`. Writes a PNG.
+behind are left out, as in `mesh/picture.py`. Writes a PNG.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from jaxtyping import Float64, UInt8
 
 from common import OUT
 from mipsjax.core.camera import Intrinsics
-from mipsjax.host.picture import facing, save_png, with_faces
-from mipsjax.host.render import render_mesh
+from mipsjax.core.rigid import from_parts
+from mipsjax.mesh.picture import facing, save_png, with_faces
+from mipsjax.mesh.render import render_mesh
 
 WIDTH, HEIGHT = 480, 400
 FIELD_OF_VIEW_DEG = 30.0  # from top to bottom, the shorter side
@@ -52,10 +53,8 @@ def pose(
     forward = np.cos(elevation) * heading + np.sin(elevation) * down
     right = np.cross(down, heading)
     away = np.linalg.norm(high - low) / 2 / np.sin(np.radians(FIELD_OF_VIEW_DEG) / 2)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = (low + high) / 2 - away * forward
-    return T
+    axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return from_parts(axes, (low + high) / 2 - away * forward)
 
 
 def panel(

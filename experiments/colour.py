@@ -21,15 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from common import DATA, Altered, changed, read_rows, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.presets import preset
+from mipsjax.config.sections import Config
 from mipsjax.core import relative
+from mipsjax.core.rigid import distance, inverse
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.host.corners import follow
-from mipsjax.landmarks import Seen, corners_of, images_of, landmarks
-from mipsjax.presets import preset
-from mipsjax.state import Pose, distance, inverse
+from mipsjax.images.corners import follow
+from mipsjax.slam.landmarks import Seen, corners_of, images_of, landmarks
+from mipsjax.submaps.state import Pose
 
 DARKER = ", darker"
 SEQUENCES = (

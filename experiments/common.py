@@ -16,14 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mipsjax import slam
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.final import finish
-from mipsjax.host.metrics import absolute_error, relative_error
-from mipsjax.state import Pose, SlamState, keyframes, map_bytes, trajectory
+from mipsjax.metrics.poses import absolute_error, relative_error
+from mipsjax.slam import step as slam
+from mipsjax.slam.finish import finish
+from mipsjax.slam.info import FrameInfo
+from mipsjax.submaps.state import Pose, SlamState, keyframes, map_bytes, trajectory
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("MIPSJAX_DATA", ROOT.parent / "shared" / "data"))  # real sequences
@@ -59,12 +60,14 @@ def run(
     sequence = see(open_sequence(path, frames=frames, input=cfg.input))
     truth = sequence.T_world_cam
     known = truth is not None and np.isfinite(truth[0]).all()
-    state = slam.start(sequence[0], sequence.intrinsics, cfg, truth[0] if known else None)
+    state, info = slam.start(sequence[0], sequence.intrinsics, cfg, truth[0] if known else None)
+    infos = [info]
     began, early = time.perf_counter(), float("nan")
     for position in range(1, len(sequence)):
         if position == WARM_UP:
             began = time.perf_counter()
-        state = slam.step(state, sequence[position], cfg)
+        state, info = slam.step(state, sequence[position], cfg)
+        infos.append(info)
         watch(state)
         if position == EARLY:
             early = peak_mb()
@@ -81,7 +84,7 @@ def run(
         f"peak_{EARLY}_mb": early,
         "peak_online_mb": loop_peak,
     }
-    return Run(state, online, sequence, row | figures(state, sequence) | speed)
+    return Run(state, online, sequence, row | figures(state, infos, sequence) | speed)
 
 
 class Altered:
@@ -114,17 +117,17 @@ def follow(
     for number, frame in enumerate(frames, 0 if state is None else len(state.records)):
         frame = frame._replace(number=number, timestamp=number / RATE)
         if state is None:
-            state = slam.start(frame, camera, cfg, T_world_cam)
+            state, _ = slam.start(frame, camera, cfg, T_world_cam)
             continue
-        state = slam.step(state, frame, cfg)
+        state, _ = slam.step(state, frame, cfg)
     assert state is not None
     return state
 
 
-def figures(state: SlamState, sequence: Sequence) -> dict[str, Any]:
+def figures(state: SlamState, infos: list[FrameInfo], sequence: Sequence) -> dict[str, Any]:
     """ATE RMSE after rigid alignment over all frames, RPE over one frame, statuses, times, memory."""
-    statuses = Counter(record.status.value for record in state.records)
-    timed = [record.info for record in state.records[WARM_UP:]]
+    statuses = Counter(str(record.status) for record in state.records)
+    timed = infos[WARM_UP:]
     row: dict[str, Any] = {}
     if sequence.T_world_cam is not None:
         poses = trajectory(state)

@@ -18,20 +18,30 @@ from typing import Any
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from common import changed, show, write_rows
-from mipsjax.bundle import MAP, adjust, make_keyframe, random_key
-from mipsjax.closure import recognise, solve
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.core import mapping, volume
+from mipsjax.core.rigid import distance, from_parts, inverse, rotation, to_twist, transform
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
-from mipsjax.host.features import detect
-from mipsjax.policy import Status
-from mipsjax.state import FrameInfo, Keyframe, Pose, Record, SlamState, Submap, distance, inverse
-from mipsjax.territory import link
+from mipsjax.images.features import detect
+from mipsjax.submaps.bundle import MAP, adjust, make_keyframe, random_key
+from mipsjax.submaps.closure import solve
+from mipsjax.submaps.ids import FrameId, SubmapId
+from mipsjax.submaps.proposals import proposed, with_links
+from mipsjax.submaps.recognition import recognise
+from mipsjax.submaps.records import Records
+from mipsjax.submaps.state import (
+    How,
+    Keyframe,
+    Pose,
+    Record,
+    SlamState,
+    Status,
+    Submap,
+)
 
 KEYFRAMES = 12  # of each submap
 CALLS, STEPS = 40, 10  # of mapping
@@ -47,8 +57,9 @@ def built(sequence: Sequence, count: int, cfg: Config) -> SlamState:
     submaps = [
         submap(sequence, *borders[i : i + 2], cfg)._replace(parent=i - 1 if i else None) for i in range(count)
     ]
-    record = Record(0, 0.0, count - 1, 0, np.eye(4), Status.OK, FrameInfo())
-    return SlamState(tuple(submaps), count - 1, (record,), sequence.intrinsics, 0)
+    last = SubmapId(count - 1)
+    record = Record(FrameId(0), 0.0, last, submaps[last].anchor.id, np.eye(4), Status.OK)
+    return SlamState(tuple(submaps), last, Records.of([record]), sequence.intrinsics, 0)
 
 
 def submap(sequence: Sequence, first: int, last: int, cfg: Config) -> Submap:
@@ -67,7 +78,7 @@ def submap(sequence: Sequence, first: int, last: int, cfg: Config) -> Submap:
     small = sequence.intrinsics.decimated(sequence.intrinsics.width // keyframes[0].depth.shape[1])
     for k in keyframes:
         p_cam, mask = volume.seen(k.depth, small, cfg.volume)
-        box = volume.grow(box, volume.moved(k.T_sub_cam, p_cam), mask, cfg.volume)
+        box = volume.grow(box, transform(k.T_sub_cam, p_cam), mask, cfg.volume)
     assert box is not None
     return Submap(learned, box, tuple(keyframes), truth[first])
 
@@ -86,13 +97,12 @@ def drifted(state: SlamState, metres: float, degrees: float, rng: np.random.Gene
     """
     edges = len(state.submaps) - 1
     whole = motion(rng, metres, degrees)
-    turn = Rotation.from_matrix(whole[:3, :3]).as_rotvec()
+    whole = to_twist(whole)
     center = state.submaps[-1].T_world_sub[:3, 3]
     for place, submap in enumerate(state.submaps):
         pose, share = submap.T_world_sub, place / edges
-        off = np.eye(4)
-        off[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
-        off[:3, 3] = center - off[:3, :3] @ center + share * whole[:3, 3]
+        turn = rotation(share * whole[3:])
+        off = from_parts(turn, center - turn @ center + share * whole[:3])
         state = state.with_submap(place, T_world_sub=off @ pose)
     for place in range(edges):
         here, after = state.submaps[place], state.submaps[place + 1]
@@ -102,11 +112,9 @@ def drifted(state: SlamState, metres: float, degrees: float, rng: np.random.Gene
 
 
 def motion(rng: np.random.Generator, metres: float, degrees: float) -> Pose:
-    T = np.eye(4)
     shift, axis = rng.standard_normal((2, 3))
-    T[:3, 3] = metres * shift / np.linalg.norm(shift)
-    T[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
-    return T
+    turn = rotation(np.radians(degrees) * axis / np.linalg.norm(axis))
+    return from_parts(turn, metres * shift / np.linalg.norm(shift))
 
 
 def closed(
@@ -117,7 +125,7 @@ def closed(
     found = recognise(state, last, [0], cfg)
     if found is None:
         return state, {"found": False}
-    state = link(state, last, found)
+    state = with_links(state, [proposed(state, state.active, last, found, How.FEATURES)])
     suspects = {(0, count - 1)}
     free = [(j, k) for j in range(count) for k in range(j + 2, count) if (j, k) != (0, count - 1)]
     for j, k in (free[i] for i in rng.choice(len(free), min(false, len(free)), replace=False)):

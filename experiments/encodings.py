@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 
 from common import changed, run, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from surface import surface_row
 from tracking import kitchen
 

@@ -27,15 +27,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from common import changed, show, write_rows
-from mipsjax import slam
-from mipsjax.bundle import mapping_camera
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.core import mapping
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
-from mipsjax.schedule import executor
-from mipsjax.state import SlamState, trajectory
+from mipsjax.slam import step as slam
+from mipsjax.submaps.bundle import mapping_camera
+from mipsjax.submaps.schedule import executor
+from mipsjax.submaps.state import SlamState, trajectory
 
 SUBMAPS = 4
 STEPS = 10
@@ -91,10 +91,10 @@ def run(images: list, sequence: Sequence, cfg: Config) -> tuple[SlamState, float
     with executor(cfg.background.executor) as beside:
         # One config for all compiled code, whatever the executor
         cfg = changed(cfg, "background", executor="inline")
-        state = slam.start(images[0], sequence.intrinsics, cfg)
+        state, _ = slam.start(images[0], sequence.intrinsics, cfg)
         began, worked = time.perf_counter(), time.process_time()
         for image in images[1:]:
-            state = slam.step(state, image, cfg, beside)
+            state, _ = slam.step(state, image, cfg, beside)
         return state, time.perf_counter() - began, time.process_time() - worked
 
 

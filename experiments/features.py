@@ -20,12 +20,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from common import DATA, show, write_rows
-from mipsjax.core.camera import Intrinsics
+from mipsjax.core.camera import Intrinsics, unproject
+from mipsjax.core.rigid import distance, transform_in_order
 from mipsjax.data.open import open_sequence
-from mipsjax.host.features import Features, detect, similar
-from mipsjax.host.registration import Match, relative_pose
-from mipsjax.host.rigid import moved_points
-from mipsjax.state import distance
+from mipsjax.images.features import Features, detect, similar
+from mipsjax.loops.registration import Match, relative_pose
 
 SEQUENCES = (("redkitchen", 10), ("small_house/living", 4))  # and every how many frames
 BINS = ((0.0, 0.005), (0.05, 0.15), (0.15, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.95))
@@ -64,8 +63,7 @@ def seen_share(a: np.ndarray, b: np.ndarray, T_b_a: np.ndarray, camera: Intrinsi
     """Share of some measured pixels of depth a whose points depth b measured as well."""
     v, u = np.mgrid[4 : camera.height : 12, 4 : camera.width : 12].reshape(2, -1)
     z = a[v, u].astype(np.float64)
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
-    p = moved_points(T_b_a, (ray * z[:, None])[z > 0])
+    p = transform_in_order(T_b_a, unproject(v, u, z, camera)[z > 0])
     p = p[p[:, 2] > 0.1]
     at = np.rint(p[:, :2] / p[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).astype(int)
     inside = np.all((at >= 0) & (at < [camera.width, camera.height]), axis=1)

@@ -45,18 +45,17 @@ from matplotlib.axes import Axes
 from scipy.spatial import KDTree
 
 from common import DATA, OUT, ROOT, Altered, Run, changed, code, read_rows, run, show, write_rows
-from mipsjax.bundle import mapping_camera
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
-from mipsjax.core.camera import Intrinsics
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.presets import preset
+from mipsjax.config.sections import Config
+from mipsjax.core.camera import Intrinsics, unproject
+from mipsjax.core.rigid import align_rigid, distance, inverse, transform
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.host.metrics import align_rigid
-from mipsjax.judge import judged
-from mipsjax.links import chain_distances, linked_pairs, links
-from mipsjax.policy import Status
-from mipsjax.presets import preset
-from mipsjax.reconstruct import reconstruct
-from mipsjax.state import SlamState, deviations_of, distance, inverse, pose_of, trajectory
+from mipsjax.mesh.reconstruct import reconstruct
+from mipsjax.slam.judge import judged
+from mipsjax.submaps.bundle import mapping_camera
+from mipsjax.submaps.links import chain_distances, linked_pairs, links
+from mipsjax.submaps.state import SlamState, Status, deviations_of, pose_of, trajectory
 
 SLIDE_FRAMES = 12
 CHANGE_FRAMES = 15
@@ -215,10 +214,10 @@ def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
         code=code(),
         poses=poses,
         true=true,
-        status=[record.status.value for record in records],
+        status=[str(record.status) for record in records],
         submap=[record.submap for record in records],
-        loops=np.array([(loop.frame, loop.first, loop.second) for loop in closed], int).reshape(-1, 3),
-        how=[loop.how for loop in closed],
+        loops=np.array([(loop.record, loop.first, loop.second) for loop in closed], int).reshape(-1, 3),
+        how=[str(loop.how) for loop in closed],
         kept=[loop.weight > 0 for loop in closed],
     )
     figure, axes = plt.subplots(figsize=(6, 6))
@@ -292,7 +291,7 @@ def stated(state: SlamState, true: np.ndarray) -> dict[str, Any]:
     for place, record in enumerate(state.records):
         deviation, _ = deviations_of(state, record)
         if deviation > 0:
-            anchor = state.submaps[record.submap].keyframes[0].number
+            anchor = state.submaps[record.submap].anchor.id
             metres, _ = distance(inverse(true[anchor]) @ true[place], pose_of(state, record))
             within.append(metres <= 3 * deviation)
     return {"within_3_deviations": float(np.mean(within)) if within else float("nan")}
@@ -318,7 +317,7 @@ def loops(found: Run, cfg: Config) -> dict[str, Any]:
     away = [chain_distances(state, place) for place in range(len(state.submaps))]
     camera = mapping_camera(state.camera, cfg)
     own = [
-        [(k.depth, true[k.number]) for k in submap.keyframes if state.records[k.number].submap == place]
+        [(k.depth, true[k.id]) for k in submap.keyframes if state.records[k.id].submap == place]
         for place, submap in enumerate(state.submaps)
     ]
     count = {"loops_true": 0, "loops_found": 0, "loops_false": 0}
@@ -349,9 +348,8 @@ def _shown(first: Posed, second: Posed, camera: Intrinsics) -> float:
     """Share of what the first frame measured that the second measured too, at its true pose."""
     (depth, T_world_first), (other, T_world_second) = first, second
     v, u = np.nonzero(depth)
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
-    T = inverse(T_world_second) @ T_world_first
-    x, y, z = (ray * depth[v, u][:, None] @ T[:3, :3].T + T[:3, 3]).T
+    T_second_first = inverse(T_world_second) @ T_world_first
+    x, y, z = transform(T_second_first, unproject(v, u, depth[v, u], camera)).T
     z = np.where(z > 0, z, np.inf)
     u, v = np.rint(camera.fx * x / z + camera.cx), np.rint(camera.fy * y / z + camera.cy)
     inside = np.isfinite(z) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
@@ -365,8 +363,8 @@ def _rightly(state: SlamState, j: int, k: int, true: np.ndarray) -> bool:
     off = []
     for link in links(state.submaps[j], state.submaps[k]):
         for place, keyframe in zip((j, k), link, strict=True):
-            anchor = state.submaps[place].keyframes[0].number
-            off.append(distance(inverse(true[anchor]) @ true[keyframe.number], keyframe.T_sub_cam)[0])
+            anchor = state.submaps[place].anchor.id
+            off.append(distance(inverse(true[anchor]) @ true[keyframe.id], keyframe.T_sub_cam)[0])
     return float(np.median(off)) < JOINED_M
 
 

@@ -28,16 +28,15 @@ import numpy as np
 import trimesh
 
 from common import DATA, OUT, Run, changed, run, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
-from mipsjax.core import volume
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
+from mipsjax.core.rigid import align_rigid, transform
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth.mesh import reference_mesh
-from mipsjax.host.metrics import align_rigid
-from mipsjax.host.picture import save_picture
-from mipsjax.host.surface import Views, compare_meshes
-from mipsjax.reconstruct import Blend, reconstruct
-from mipsjax.state import Pose, SlamState, keyframe_bytes, trajectory
+from mipsjax.mesh.picture import save_picture
+from mipsjax.mesh.reconstruct import Blend, reconstruct
+from mipsjax.metrics.surface import Views, compare_meshes
+from mipsjax.submaps.state import Pose, SlamState, keyframe_bytes, trajectory
 from seams import errors, seams
 
 NAMES = ("corridor-loop+noise", "apartment+noise", "no-loop+noise", "living")
@@ -93,7 +92,7 @@ def analytic_row(done: Run, mesh: trimesh.Trimesh, submap: np.ndarray) -> dict[s
 def plan(done: Run, T: Pose, mesh: trimesh.Trimesh, path: str) -> None:
     """The camera's way, the true one and the walls from above, metres; submaps by colour, anchors as dots."""
     poses, truth = trajectory(done.state)[:, :3, 3], done.sequence.T_world_cam
-    at = volume.moved(T, poses)
+    at = transform(T, poses)
     place = np.array([record.submap for record in done.state.records])
     figure, axes = plt.subplots(figsize=(7, 7))
     walls = mesh.vertices[np.abs(mesh.vertices[:, 1] - truth[:, 1, 3].mean()) < SLICE]
@@ -128,7 +127,7 @@ class Memory:
         self._trim(0)
         with open("/proc/self/statm") as file:
             _, resident, shared, *_ = (int(pages) * resource.getpagesize() for pages in file.read().split())
-        kept = {k.number: k for submap in state.submaps for k in submap.keyframes}.values()
+        kept = {k.id: k for submap in state.submaps for k in submap.keyframes}.values()
         pixels = sum(k.depth.nbytes + k.color.nbytes for k in kept)
         arrays = {id(a): a.nbytes for a in jax.tree.leaves(state) if isinstance(a, np.ndarray | jax.Array)}
         sizes = {

@@ -20,19 +20,21 @@ import jax
 import numpy as np
 
 from common import DATA, Altered, changed, print_table, read_rows, show, write_rows
-from mipsjax import slam, straighten
-from mipsjax.background import taken_over
-from mipsjax.closure import closed_again
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.presets import preset
+from mipsjax.config.sections import Config
 from mipsjax.core import views
+from mipsjax.core.rigid import distance, inverse, rigid
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.host.metrics import absolute_error
-from mipsjax.host.trust import ALLOWED, of_pair, trusted
-from mipsjax.presets import preset
-from mipsjax.schedule import INLINE
-from mipsjax.state import SlamState, distance, inverse, rigid
+from mipsjax.metrics.poses import absolute_error
+from mipsjax.slam import step as slam
+from mipsjax.slam import straighten
+from mipsjax.submaps.background import taken_over
+from mipsjax.submaps.closure import closed_again
+from mipsjax.submaps.schedule import INLINE
+from mipsjax.submaps.state import SlamState
+from mipsjax.uncertainty.trust import ALLOWED, of_pair, trusted
 
 LATE = ", colour late"
 SEQUENCES = {
@@ -58,10 +60,10 @@ def travelled(name: str, stride: int, cfg: Config) -> tuple[SlamState, np.ndarra
     true = sequence.T_world_cam
     assert true is not None
     sequence = Altered(sequence, late) if name.endswith(LATE) else sequence
-    state = slam.start(sequence[0], sequence.intrinsics, cfg, true[0])
+    state, _ = slam.start(sequence[0], sequence.intrinsics, cfg, true[0])
     for place in range(1, len(sequence)):
-        state = slam.step(state, sequence[place], cfg)
-    return closed_again(taken_over(state, INLINE), cfg), true
+        state, _ = slam.step(state, sequence[place], cfg)
+    return closed_again(taken_over(state, INLINE, cfg), cfg), true
 
 
 def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str, Any]:
@@ -76,7 +78,7 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
         jax.clear_caches()
     nodes = straighten._keyframes(state)
     poses = np.stack([node.T_world_cam for node in nodes])
-    true = true[[node.keyframe.number for node in nodes]]
+    true = true[[node.keyframe.id for node in nodes]]
     pairs = [straighten._followed(nodes, *places, state, cfg) for places in straighten._near(poses, cfg)]
     measured = straighten._measured(nodes, pairs, 1.0, state, cfg)
     said = [found for i in range(len(pairs)) if (found := of_pair(measured, i)) is not None]
@@ -85,7 +87,7 @@ def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str,
         measured = straighten._measured(nodes, pairs, trust, state, cfg)
     factors = list(straighten._pair_factors(pairs, measured, cfg))
     factors += straighten._as_tracked(poses, {factor.second for factor in factors}, cfg)
-    factors += straighten._link_factors(state, [node.keyframe.number for node in nodes], cfg)
+    factors += straighten._link_factors(state, [node.keyframe.id for node in nodes], cfg)
     solved = straighten._solved(poses, factors)
     if form == "planes up to 5 mm":
         views.NOISE = even

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common import show, write_rows
-from mipsjax.host.factors import Factor, PointToPlane, Pose, RelativePose
-from mipsjax.host.metrics import angles
-from mipsjax.host.posegraph import solve
+from mipsjax.core.rigid import angles, from_parts, transform
+from mipsjax.loops.factors import Factor, PointToPlane, Pose, RelativePose
+from mipsjax.loops.posegraph import solve
 
 SPACING = 4.0  # metres between neighbours
 DRIFTS = ((0.2, 5.0), (0.5, 10.0), (1.0, 20.0))  # metres and degrees
@@ -50,9 +50,7 @@ class World(NamedTuple):
 
 
 def pose(rotation: Rotation, translation: np.ndarray) -> Pose:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation.as_matrix(), translation
-    return T
+    return from_parts(rotation.as_matrix(), translation)
 
 
 def noise(rng: np.random.Generator, metres: float, radians: float) -> Pose:
@@ -117,9 +115,8 @@ def wall_edge(rng: np.random.Generator, first: int, second: int, T_first_second:
     normals = np.repeat(np.eye(3), WALL_POINTS, axis=0)
     along = rng.uniform(-2, 2, normals.shape)
     p = T_first_second[:3, 3] / 2 + along * (1 - normals) + 1.5 * normals
-    q = (p + rng.normal(size=(len(p), 1)) * WALL_NOISE * normals) @ T_second_first[:3, :3].T + T_second_first[
-        :3, 3
-    ]
+    seen = p + rng.normal(size=(len(p), 1)) * WALL_NOISE * normals
+    q = transform(T_second_first, seen)
     return [PointToPlane(first, second, p, normals, q, WALL_SIGMA)]
 
 

@@ -15,14 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from common import run, show, write_rows
-from mipsjax.bundle import mapping_stride
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
+from mipsjax.core.camera import unproject
 from mipsjax.core.mapping import Learned
-from mipsjax.core.volume import moved
+from mipsjax.core.rigid import transform
 from mipsjax.data.sequence import Sequence
-from mipsjax.state import SlamState, Submap
+from mipsjax.submaps.bundle import mapping_stride
+from mipsjax.submaps.state import SlamState, Submap
 
 FAR = 3.0  # metres
 POINTS = 20_000
@@ -45,14 +46,14 @@ def held_out(submap: Submap, sequence: Sequence, cfg: Config, seed: int) -> np.n
     """Points in the submap's frame, metres."""
     camera, every, parts = sequence.intrinsics, mapping_stride(sequence.intrinsics, cfg), []
     for keyframe in submap.keyframes:
-        depth = sequence[keyframe.number].depth
+        depth = sequence[keyframe.id].depth
         assert depth is not None
         v, u = (
             x.ravel() for x in np.mgrid[every // 2 : camera.height : every, every // 2 : camera.width : every]
         )
         z = depth[v, u].astype(np.float64)
-        p_cam = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
-        parts.append(moved(keyframe.T_sub_cam, p_cam[(z > 0) & (z < FAR)]))
+        p_cam = unproject(v, u, z, camera)
+        parts.append(transform(keyframe.T_sub_cam, p_cam[(z > 0) & (z < FAR)]))
     return np.random.default_rng(seed).permutation(np.concatenate(parts))[:POINTS]
 
 

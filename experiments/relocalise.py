@@ -20,15 +20,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from common import OUT, follow, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
-from mipsjax.core.volume import moved
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
+from mipsjax.core.rigid import align_rigid, transform
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.host.metrics import align_rigid
-from mipsjax.links import joined
-from mipsjax.policy import Status
-from mipsjax.state import trajectory
+from mipsjax.submaps.links import joined
+from mipsjax.submaps.state import Status, trajectory
 
 FIRST = 300
 COVERED = 150
@@ -86,7 +84,7 @@ def trial(name: str, case: str, seed: int) -> dict[str, Any]:
     state = follow(frames, sequence.intrinsics, cfg, sequence.T_world_cam[0])
     truth = sequence.T_world_cam[list(places), :3, 3]
     poses = trajectory(state)[:, :3, 3]
-    error = np.linalg.norm(moved(align_rigid(poses[:FIRST], truth[:FIRST]), poses) - truth, axis=1)
+    error = np.linalg.norm(transform(align_rigid(poses[:FIRST], truth[:FIRST]), poses) - truth, axis=1)
     seen = np.array(places) >= 0
     error[~seen] = np.nan
     home = joined(state, 0)

@@ -30,12 +30,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from common import OUT, changed, follow, show, write_rows
-from mipsjax import closure, slam, territory
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.data.open import open_sequence
-from mipsjax.host.metrics import absolute_error
-from mipsjax.state import SlamState, trajectory
+from mipsjax.metrics.poses import absolute_error
+from mipsjax.slam import step as slam
+from mipsjax.submaps import closure, proposals
+from mipsjax.submaps.state import SlamState, trajectory
 
 AROUND = 10  # frames after a revisit
 
@@ -43,13 +44,13 @@ AROUND = 10  # frames after a revisit
 @contextmanager
 def unregistered() -> Iterator[None]:
     """Frames are linked to other submaps at the pose that was guessed, as if they had not been registered there."""
-    original = territory.sight
+    original = proposals.sight
 
     def sight(state, place, keyframe, expected, cfg, measured=False):
-        found = original(state, place, keyframe, territory.Expected(expected.T_sub_cam), cfg, measured)
+        found = original(state, place, keyframe, proposals.Expected(expected.T_sub_cam), cfg, measured)
         return None if found is None else found._replace(T_sub_cam=expected.T_sub_cam)
 
-    with replaced(territory, "sight", sight):
+    with replaced(proposals, "sight", sight):
         yield
 
 
@@ -61,11 +62,11 @@ def glued() -> Iterator[None]:
     def solve(state, cfg):
         return state, original(state, cfg)[1]
 
-    def govern(state, cfg):
+    def govern(state, found, cfg):
         loop = state.loops[-1] if state.loops else None
-        newest = state.submap.keyframes[-1].number
-        met = loop is not None and loop.weight > 0 and loop.frame == newest
-        return loop.second if met else governed(state, cfg)
+        newest = state.submap.keyframes[-1].id
+        met = loop is not None and loop.weight > 0 and loop.record == newest
+        return loop.second if met else governed(state, found, cfg)
 
     with replaced(closure, "solve", solve), replaced(slam, "govern", govern):
         yield

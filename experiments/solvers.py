@@ -17,20 +17,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import lineax as lx
 import numpy as np
 import optimistix as optx
 
 from basin import DONE_M, DONE_RAD, fitted
 from common import show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core import solvers, tracking
-from mipsjax.core.camera import Intrinsics, transform
+from mipsjax.core.camera import Intrinsics
+from mipsjax.core.rigid import distance, perturbed, transform
 from mipsjax.data.open import open_sequence
-from mipsjax.state import distance
 
 OFFSET_M, OFFSET_RAD = 0.05, np.radians(5)
 SMALLEST = 1e-12  # square metres, under the root of the robust cost
@@ -42,8 +41,7 @@ def with_optimistix(
     """The robust cost of `levenberg_marquardt` as a sum of squares, solved by the library."""
 
     def residuals(twist, _):
-        moved = T @ jaxlie.SE3.exp(twist).as_matrix()
-        psi = nf.tsdf(field, transform(moved, points.p_cam), cfg.field).psi
+        psi = nf.tsdf(field, transform(perturbed(T, twist), points.p_cam), cfg.field).psi
         cost = solvers.robust_cost(psi, cfg.track.go.robust) + SMALLEST
         return jnp.sqrt(solvers.precisions(points, cfg)) * jnp.sqrt(cost)
 
@@ -56,7 +54,7 @@ def with_optimistix(
         max_steps=cfg.track.go.steps,
         throw=False,
     )
-    return T @ jaxlie.SE3.exp(found.value).as_matrix()
+    return perturbed(T, found.value)
 
 
 def with_ours(
@@ -107,7 +105,7 @@ def main() -> None:
         )
         v, w = (d / np.linalg.norm(d) * rng.random() for d in rng.standard_normal((2, 3)))
         twist = jnp.asarray(np.r_[v * OFFSET_M, w * OFFSET_RAD], jnp.float32)
-        start = jnp.asarray(poses[place], jnp.float32) @ jaxlie.SE3.exp(twist).as_matrix()
+        start = perturbed(jnp.asarray(poses[place], jnp.float32), twist)
         cases.append((submap.field, start, points))
         truth.append(poses[place])
     rows = [

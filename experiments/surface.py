@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from common import OUT, Run, run, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.sections import Config
 from mipsjax.data.open import open_sequence
 from mipsjax.data.synth.mesh import reference_mesh
-from mipsjax.host.picture import save_picture
-from mipsjax.host.surface import Views, compare_meshes
-from mipsjax.reconstruct import reconstruct
+from mipsjax.mesh.picture import save_picture
+from mipsjax.mesh.reconstruct import reconstruct
+from mipsjax.metrics.surface import Views, compare_meshes
 
 EVERY = 10  # frames whose exact depth decides what was seen
 SAMPLES = (

@@ -12,9 +12,9 @@ import argparse
 from typing import Any
 
 from common import DATA, changed, run, show, write_rows
-from mipsjax.compilation import enable_cache
-from mipsjax.config import Config
-from mipsjax.presets import preset
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.presets import preset
+from mipsjax.config.sections import Config
 
 SYNTH = ("room-fast", "room-fast+noise+blur")
 

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mipsjax.config import SensorConfig
+from mipsjax.app.evaluate import read_trajectory
+from mipsjax.config.sections import SensorConfig
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
-from mipsjax.evaluate import read_trajectory
-from mipsjax.host.agreement import LIMIT, MOST_VIEWS, Agreement, Noise, Views, agreement
-from mipsjax.state import thumbnail_stride
+from mipsjax.submaps.state import thumbnail_stride
+from mipsjax.uncertainty.agreement import LIMIT, MOST_VIEWS, Agreement, Noise, Views, agreement
 
 
 def verdict(sequence: Sequence, T_world_cam: np.ndarray) -> Agreement | None:

@@ -14,7 +14,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from mipsjax.compilation import enable_cache
+from mipsjax.app.compilation import enable_cache
 
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.mapping import Learned
 from mipsjax.core.volume import Box
-from mipsjax.policy import Status
-from mipsjax.state import FrameInfo, Keyframe, Record, SlamState, Submap
+from mipsjax.submaps.ids import FrameId, RecordId, SubmapId
+from mipsjax.submaps.records import Records
+from mipsjax.submaps.state import Keyframe, Record, SlamState, Status, Submap
 
 CAMERA = Intrinsics(20.0, 20.0, 9.5, 7.5, 20, 16)
 DEPTH = np.full((16, 20), 2.0, np.float32)
@@ -23,8 +24,8 @@ def pose(rotation_deg=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarra
     return T
 
 
-def keyframe(number: int, T_sub_cam: np.ndarray | None = None) -> Keyframe:
-    return Keyframe(number, DEPTH, COLOR, np.eye(4) if T_sub_cam is None else T_sub_cam)
+def keyframe(record_id: int, T_sub_cam: np.ndarray | None = None) -> Keyframe:
+    return Keyframe(RecordId(record_id), DEPTH, COLOR, np.eye(4) if T_sub_cam is None else T_sub_cam)
 
 
 def submap(*keyframes: Keyframe, T_world_sub: np.ndarray | None = None, learned=None) -> Submap:
@@ -34,5 +35,7 @@ def submap(*keyframes: Keyframe, T_world_sub: np.ndarray | None = None, learned=
 
 
 def state(*submaps: Submap, active: int = 0) -> SlamState:
-    record = Record(0, 0.0, active, 0, np.eye(4), Status.OK, FrameInfo())
-    return SlamState(submaps, active, (record,), CAMERA, 0)
+    """After one frame, which hangs on the anchor of the active submap."""
+    anchor = submaps[active].anchor
+    record = Record(FrameId(0), 0.0, SubmapId(active), anchor.id, np.eye(4), Status.OK)
+    return SlamState(submaps, SubmapId(active), Records.of([record]), CAMERA, 0)

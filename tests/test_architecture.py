@@ -13,33 +13,20 @@ import mipsjax
 
 ROOT = Path(mipsjax.__file__).parent
 
-# From the left; a module imports only from layers before its own, and from its own package.
+# From the left; a module imports only from rooms before its own, and from its own room.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "config", "config_submaps", "config_tracking", "files", "compilation"}),
-    frozenset({"presets"}),
+    frozenset({"errors"}),
+    frozenset({"files", "config"}),
     frozenset({"core"}),
-    frozenset({"host", "data", "policy", "schedule"}),
-    frozenset({"state", "rest"}),
-    frozenset({"bundle", "landmarks", "links"}),
-    frozenset({"territory", "background", "surfaces", "straighten", "tracker"}),
-    frozenset({"closure"}),
-    frozenset({"recovery"}),
-    frozenset({"slam", "final", "judge"}),
-    frozenset({"reconstruct", "outputs", "summary", "options", "commandline"}),
+    frozenset({"data", "images", "uncertainty"}),
+    frozenset({"loops"}),
+    frozenset({"submaps"}),
+    frozenset({"slam", "mesh"}),
+    frozenset({"metrics"}),
+    frozenset({"app"}),
     frozenset({"run", "evaluate"}),
 )
 LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
-
-# Imports between neighbours of one layer that are meant. No cycle may come of them (tested below).
-NEIGHBOURS = {
-    ("config", "config_submaps"),  # the whole configuration holds the part for several submaps
-    ("config", "config_tracking"),  # and that for tracking
-    ("files", "errors"),  # a file that cannot be written raises OutputError
-    ("commandline", "options"),  # the command line is one source of options beside files and presets
-    ("landmarks", "links"),  # a frame of a neighbour is where the frame that both share says
-    ("outputs", "options"),  # config.json holds the resolved options
-    ("outputs", "summary"),  # metrics.json holds the run in numbers
-}
 
 # Packages of the host side, kept out of the functional core
 HOST_ONLY = {"gtsam", "cv2", "trimesh", "skimage", "matplotlib", "tyro", "tqdm", "viser"}
@@ -88,10 +75,8 @@ def modules_of_ours(tree: ast.AST) -> set[str]:
 MODULES = [m for m in SOURCES if m]
 
 
-def test_layers_and_neighbours_are_those_of_the_package():
+def test_layers_are_those_of_the_package():
     assert LEVEL.keys() == {part_of(module) for module in MODULES}
-    imports = {(part_of(m), part_of(other)) for m in MODULES for other in modules_of_ours(SOURCES[m])}
-    assert imports >= NEIGHBOURS, "no import needs this any more"
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -100,7 +85,7 @@ def test_imports_come_from_the_left(module):
     for other in modules_of_ours(SOURCES[module]):
         source = part_of(other)
         left = source in LEVEL and LEVEL[source] < LEVEL[part]
-        allowed = source == part or left or (part, source) in NEIGHBOURS
+        allowed = source == part or left
         assert allowed, f"{module} imports {other}"
 
 
@@ -123,7 +108,7 @@ def test_the_core_reads_no_files_and_no_clock(module):
 
 def test_only_the_pose_graph_imports_gtsam():
     users = {m for m in SOURCES if "gtsam" in {name.split(".")[0] for name in imported(SOURCES[m])}}
-    assert users <= {"host.posegraph"}
+    assert users <= {"loops.posegraph"}
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if part_of(m) == "data"])
@@ -132,7 +117,7 @@ def test_readers_use_only_the_camera_of_the_core(module):
 
 
 def test_config_and_errors_use_the_standard_library_alone():
-    for module in ("config", "errors", "presets"):
+    for module in [m for m in MODULES if part_of(m) in ("config", "errors", "files")]:
         packages = {name.split(".")[0] for name in imported(SOURCES[module])} - {"mipsjax"}
         assert packages <= sys.stdlib_module_names, module
 

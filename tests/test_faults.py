@@ -15,11 +15,14 @@ import cv2
 import jax
 import numpy as np
 import pytest
+import trimesh
 
 import running
 from compilations import compilations
-from mipsjax import outputs, run, slam
-from mipsjax.state import SlamState
+from mipsjax.app import outputs, run, signals
+from mipsjax.slam import step as slam
+from mipsjax.slam.info import FrameInfo
+from mipsjax.submaps.state import SlamState
 from running import FRAMES, Program, Result, image, read, write
 
 # Fixtures: as assignments, so that parameters of the same name are no redefinitions of an import
@@ -235,7 +238,7 @@ def test_27_poses_that_are_hardly_rotations(program: Program, sequence: Path) ->
     assert "1 without truth" in result.metrics["protocol"]["ate_rmse_m"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", signals.ENDING)
 def test_40_41_a_signal_finishes_the_frame(
     program: Program,
     sequence: Path,
@@ -244,7 +247,7 @@ def test_40_41_a_signal_finishes_the_frame(
 ) -> None:
     step = slam.step
 
-    def interrupted(state: SlamState, *rest: object) -> SlamState:
+    def interrupted(state: SlamState, *rest: object) -> tuple[SlamState, FrameInfo]:
         if len(state.records) == BAD:
             os.kill(os.getpid(), number)
         return step(state, *rest)  # pyright: ignore[reportArgumentType]
@@ -257,19 +260,69 @@ def test_40_41_a_signal_finishes_the_frame(
     assert signal.getsignal(number) == before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", signals.ENDING)
 def test_40_41_a_second_signal_ends_at_once(number: signal.Signals) -> None:
-    """The first one leaves both to the system, which ends the process without asking it."""
+    """The first one leaves all to the system, which ends the process without asking it."""
 
     def handlers() -> list[object]:
-        return [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
+        return [signal.getsignal(number) for number in signals.ENDING]
 
     before = handlers()
-    with run._signals() as stop:
+    with signals.noted() as stop:
         assert not stop()
         signal.raise_signal(number)
-        assert stop() and handlers() == [signal.SIG_DFL] * 2
+        assert stop() and handlers() == [signal.SIG_DFL] * len(signals.ENDING)
     assert handlers() == before
+
+
+@pytest.mark.parametrize("number", signals.ENDING)
+def test_a_signal_during_the_mesh_loses_the_mesh_only(
+    program: Program,
+    sequence: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+) -> None:
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(run, "reconstruct", interrupted)
+    result = program(sequence, "--frames", ":3", mesh=True)
+    assert result.code == 130 and "all results but the mesh" in result.stderr
+    assert result.metrics["mesh"] == "unfinished" and result.metrics["frames"] == 3
+    assert (result.out / "trajectory.txt").exists() and not (result.out / "mesh.ply").exists()
+
+
+def test_a_mesh_that_fails_loses_the_mesh_only(
+    program: Program, sequence: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(run, "reconstruct", failing)
+    result = program(sequence, "--frames", ":3", mesh=True)
+    assert result.code == 1 and "no room" in result.stderr
+    assert result.metrics["mesh"] == "unfinished" and result.metrics["frames"] == 3
+    assert (result.out / "trajectory.txt").exists() and (result.out / "status.csv").exists()
+
+
+def test_truth_in_surveyed_coordinates(program: Program, sequence: Path) -> None:
+    """As near the origin, but for steps of the last bits of double precision."""
+    place = np.array([691_234.5, 5_335_678.25, 512.125])
+    path = sequence / "groundtruth.txt"
+    near = program(sequence, "--frames", ":3", mesh=True)
+    mesh = trimesh.load_mesh(near.out / "mesh.ply", process=False)
+    shutil.rmtree(near.out)
+    rows = np.loadtxt(path)
+    rows[:, 1:4] += place
+    np.savetxt(path, rows, fmt="%.9f")
+    far = program(sequence, "--frames", ":3", mesh=True)
+    moved = trimesh.load_mesh(far.out / "mesh.ply", process=False)
+    assert far.code == 0 and far.metrics["mesh"] == "done"
+    assert far.metrics["ate_rmse_m"] == pytest.approx(near.metrics["ate_rmse_m"], abs=1e-4)
+    # Cells are whole voxels of the world, so that surfaces agree within one and not vertex by vertex
+    spread = [np.percentile(vertices, [5, 50, 95], axis=0) for vertices in (moved.vertices, mesh.vertices)]
+    np.testing.assert_allclose(spread[0] - place, spread[1], atol=0.05)
+    assert len(np.unique(moved.vertices[:, 1])) > 0.9 * len(np.unique(mesh.vertices[:, 1]))
 
 
 def test_a_reader_that_goes_away_ends_no_run(exported: Path, tmp_path: Path) -> None:
@@ -311,6 +364,22 @@ def test_49_a_running_run_is_left_alone(program: Program, sequence: Path) -> Non
         result = program(sequence)
         assert result.code == 5 and "in use by another run" in result.stderr
         assert [path.name for path in program.out.iterdir()] == [outputs.LOCK]
+
+
+def test_a_folder_that_is_deleted_meanwhile_loses_nothing(
+    program: Program, sequence: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = run.judged
+
+    def deleted(*arguments: object) -> object:
+        shutil.rmtree(program.out)
+        return judged(*arguments)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(run, "judged", deleted)
+    result = program(sequence, "--frames", ":3")
+    assert result.code == 0 and "deleted or taken" in result.stdout and not program.out.exists()
+    beside = program.out.with_name("out-2")
+    assert json.loads((beside / "metrics.json").read_text())["frames"] == 3 and outputs.is_ours(beside)
 
 
 def test_input_is_never_written_to(program: Program, sequence: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mipsjax import _check_jaxlib
-from mipsjax.config import FieldConfig
+from mipsjax.config.sections import FieldConfig
 from mipsjax.core import field as nf
 
 POINTS, REPEATS = 1536, 10
@@ -36,13 +36,13 @@ def test_derivatives_of_the_hash_grid_repeat_to_the_bit_and_agree_with_differenc
     points = jax.random.uniform(jax.random.key(2), (POINTS, 3), minval=-2, maxval=2)
 
     def total(p):
-        return jnp.sum(nf.fine_tsdf(field, p, cfg).psi)
+        return jnp.sum(nf.tsdf(field, p, cfg).psi)
 
     gradient = jax.jit(jax.grad(total))
     results = [np.asarray(gradient(points)) for _ in range(REPEATS)]
     for again in results[1:]:
         np.testing.assert_array_equal(again, results[0])
-    psi = jax.jit(lambda p: nf.fine_tsdf(field, p, cfg).psi)
+    psi = jax.jit(lambda p: nf.tsdf(field, p, cfg).psi)
     shift = jnp.array([[STEP, 0, 0]])
     numerical = np.asarray(psi(points + shift) - psi(points - shift)) / (2 * STEP)
     # The field is piecewise: a cell's border or a relu within a step makes single points differ

@@ -12,26 +12,31 @@ import pytest
 
 import maps
 from compilations import compilations
-from mipsjax import closure, final, recovery, schedule, slam, territory
-from mipsjax.bundle import make_keyframe
-from mipsjax.config import Config, InputConfig
-from mipsjax.config_submaps import LoopConfig, VolumeConfig
-from mipsjax.config_tracking import GuardConfig
-from mipsjax.core import mapping, volume
+from mipsjax.config.presets import PRESETS
+from mipsjax.config.sections import Config, InputConfig
+from mipsjax.config.submaps import LoopConfig, VolumeConfig
+from mipsjax.config.tracking import GuardConfig
+from mipsjax.core import mapping
+from mipsjax.core.rigid import distance, transform
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
-from mipsjax.final import finish
-from mipsjax.host.factors import PointToPlane
-from mipsjax.host.features import detect
-from mipsjax.host.posegraph import solve
-from mipsjax.links import Link, joined, linked_pairs, links
-from mipsjax.policy import NEW, Status, decide
-from mipsjax.presets import PRESETS
-from mipsjax.reconstruct import reconstruct
-from mipsjax.rest import awake, rested
-from mipsjax.state import SlamState, Submap, distance, pose_of, trajectory, world_pose
-from mipsjax.surfaces import Pair, pair_of, plane_factor, pose_factor
-from mipsjax.territory import Sighting, enter
+from mipsjax.images.features import detect
+from mipsjax.loops.factors import PointToPlane
+from mipsjax.loops.posegraph import solve
+from mipsjax.mesh.reconstruct import reconstruct
+from mipsjax.slam import finish as finishing
+from mipsjax.slam import recovery
+from mipsjax.slam import step as slam
+from mipsjax.slam.finish import finish
+from mipsjax.slam.policy import decide
+from mipsjax.submaps import closure, proposals, schedule
+from mipsjax.submaps.bundle import make_keyframe
+from mipsjax.submaps.dormant import packed, unpacked
+from mipsjax.submaps.links import Link, joined, linked_pairs, links
+from mipsjax.submaps.proposals import Sighting
+from mipsjax.submaps.state import SlamState, Status, Submap, pose_of, trajectory, world_pose
+from mipsjax.submaps.surfaces import Pair, pair_of, plane_factor, pose_factor
+from mipsjax.submaps.switching import NEW, begin, enter
 
 pytestmark = pytest.mark.slow
 
@@ -70,9 +75,9 @@ def run(
     frames: list[Frame], camera, cfg: Config = CFG, executor: schedule.Executor = schedule.INLINE
 ) -> list[SlamState]:
     """The state after each frame."""
-    states = [slam.start(frames[0], camera, cfg)]
+    states = [slam.start(frames[0], camera, cfg)[0]]
     for frame in frames[1:]:
-        states.append(slam.step(states[-1], frame, cfg, executor))
+        states.append(slam.step(states[-1], frame, cfg, executor)[0])
     return states
 
 
@@ -96,7 +101,7 @@ def meeting(sequence) -> Pair:
         anchored, *support = (
             make_keyframe(sequence[n], n, np.linalg.inv(T[anchor]) @ T[n], CFG, camera) for n in numbers
         )
-        made, ok = territory.begin(anchored, support, T[anchor], 200, camera, CFG)
+        made, ok = begin(anchored, support, T[anchor], 200, camera, CFG)
         assert ok
         return made
 
@@ -116,11 +121,11 @@ def test_a_second_submap_begins_and_the_first_takes_over_again(states):
 def test_a_new_submap_counts_from_its_anchor(states):
     """Its support is older, though it comes after it in the list."""
     begun = next(state for state in states if len(state.submaps) == 2)
-    numbers = [keyframe.number for keyframe in begun.submap.keyframes]
-    assert len(numbers) == 1 + CFG.volume.support and begun.submap.newest == 0
+    numbers = [keyframe.id for keyframe in begun.submap.keyframes]
+    assert len(numbers) == 1 + CFG.volume.support and begun.submap.newest is begun.submap.anchor
     assert max(numbers) == numbers[0] == len(begun.records) - 1
     following = states[len(begun.records)].records[-1]
-    assert following.keyframe == 0 and not following.info.keyframe
+    assert following.keyframe == numbers[0] and not following.is_keyframe
 
 
 def test_support_is_what_was_seen_last():
@@ -129,8 +134,10 @@ def test_support_is_what_was_seen_last():
     numbers = (50, 40, 30, 20, 51, 60)
     keyframes = (maps.keyframe(n, maps.pose(translation=(n / 100 - 0.5, 0.0, 0.0))) for n in numbers)
     old = maps.submap(*keyframes, learned=mapping.create(jax.random.key(0), cfg))
-    begun = enter(maps.state(old), NEW, cfg).submap
-    assert [keyframe.number for keyframe in begun.keyframes] == [60, 51, 50, 40]
+    after, problem = enter(maps.state(old), NEW, cfg)
+    begun = after.submap
+    assert not problem
+    assert [keyframe.id for keyframe in begun.keyframes] == [60, 51, 50, 40]
     shifts = [keyframe.T_sub_cam[0, 3] for keyframe in begun.keyframes]
     np.testing.assert_allclose(shifts, [0.0, -0.09, -0.1, -0.2], atol=1e-9)
 
@@ -168,9 +175,9 @@ def test_what_a_submap_learned_by_rests_where_the_camera_is_not(states):
         for place, submap in enumerate(state.submaps):
             assert rests(submap) is (place != state.active)
     learned = states[-1].submap.learned
-    resting = rested(learned)
+    resting = packed(learned)
     assert nbytes(resting.optimizer) < 0.45 * nbytes(learned.optimizer)
-    again = awake(resting)
+    again = unpacked(resting)
     for before, after in zip(*map(jax.tree.leaves, (learned.optimizer, again.optimizer)), strict=True):
         assert after.shape == before.shape and after.dtype == before.dtype
         np.testing.assert_allclose(after, before, rtol=2**-8)
@@ -205,20 +212,20 @@ def test_nothing_compiles_after_the_first_frames(frames, sequence, meeting):
     cfg = replace(CFG, loop=replace(CFG.loop, tolerance=1e-6))
     # JAX keeps programs apart by this setting: under a value of our own none is found that another test compiled
     with jax.numpy_rank_promotion("warn"):
-        state = slam.start(frames[0], sequence.intrinsics, cfg)
+        state, _ = slam.start(frames[0], sequence.intrinsics, cfg)
         for frame in frames[1:4]:
-            state = slam.step(state, frame, cfg)
+            state, _ = slam.step(state, frame, cfg)
         with compilations() as compiled:
             for frame in frames[4:]:
-                state = slam.step(state, frame, cfg)
+                state, _ = slam.step(state, frame, cfg)
             factor = plane_factor(meeting, True, state.camera, cfg)
-    assert len(state.submaps) == 2 and state.submaps[0].keyframes[-1].number > FRAMES
+    assert len(state.submaps) == 2 and state.submaps[0].keyframes[-1].id > FRAMES
     assert factor is not None and not compiled
 
 
 def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(states, monkeypatch):
     before, moved_to, given, firm = states[-1], maps.pose(translation=(1.0, 0.0, 0.0)), [], []
-    real = final.tracking.align
+    real = finishing.tracking.align
 
     def closed_again(state: SlamState, cfg: Config) -> SlamState:
         given.append(state)
@@ -232,9 +239,9 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
         firm.append(colour)
         return real(field, depth, T, colour, *others)
 
-    monkeypatch.setattr(final, "closed_again", closed_again)
-    monkeypatch.setattr(final, "straightened", straightened)
-    monkeypatch.setattr(final.tracking, "align", align)
+    monkeypatch.setattr(finishing, "closed_again", closed_again)
+    monkeypatch.setattr(finishing, "straightened", straightened)
+    monkeypatch.setattr(finishing.tracking, "align", align)
     after = finish(before, CFG)
     first, second = given
     for old, still, new in zip(first.submaps, second.submaps, after.submaps, strict=True):
@@ -252,7 +259,7 @@ def test_finish_closes_loops_and_moves_keyframes_before_it_learns_and_aligns(sta
 
 
 def test_keyframes_stay_where_nothing_is_learned_there(states, monkeypatch):
-    monkeypatch.setattr(final, "straightened", None)
+    monkeypatch.setattr(finishing, "straightened", None)
     finish(states[-1], replace(CFG, map=replace(CFG.map, final_steps=0)))
 
 
@@ -291,7 +298,7 @@ def test_surfaces_say_nothing_along_the_chain(states):
 
 def to_scene(sequence, p_first: np.ndarray) -> np.ndarray:
     """True distances to the room of points in the first submap."""
-    p_world = volume.moved(sequence.T_world_cam[0], p_first)
+    p_world = transform(sequence.T_world_cam[0], p_first)
     return np.asarray(sequence.scene.distance(jnp.asarray(p_world, jnp.float32)))
 
 
@@ -304,7 +311,7 @@ def moved(pair: Pair, metres: np.ndarray) -> Pair:
 
 def across(factor: PointToPlane, T_first_second: np.ndarray) -> float:
     """Median distance between matched points across the surface, metres."""
-    error = factor.p_first - volume.moved(T_first_second, factor.q_second)
+    error = factor.p_first - transform(T_first_second, factor.q_second)
     return float(np.median(np.abs(np.sum(error * factor.n_first, axis=1))))
 
 
@@ -343,7 +350,7 @@ def test_a_frame_of_nowhere_is_lost(states, frames):
     other = frames[-1]._replace(color=color, number=99, timestamp=99.0)
     wall, nothing = (other._replace(depth=depth) for depth in (np.full(shape, 0.3, np.float32), noise))
     for frame, cfg in (wall, CFG), (wall, replace(CFG, guard=GuardConfig())), (nothing, CFG):
-        after = slam.step(states[-1], frame, cfg)
+        after, _ = slam.step(states[-1], frame, cfg)
         assert after.records[-1].status is Status.LOST
         assert len(after.submaps) == len(states[-1].submaps)
 
@@ -351,7 +358,7 @@ def test_a_frame_of_nowhere_is_lost(states, frames):
 @pytest.mark.parametrize("kept", [True, False], ids=["keyframe", "between"])
 def test_a_frame_is_recognised_in_a_submap_by_its_image(states, frames, kept):
     state = states[-1]
-    keyframes = {keyframe.number for keyframe in state.submaps[1].keyframes}
+    keyframes = {keyframe.id for keyframe in state.submaps[1].keyframes}
     assert state.active == 0
     # On the way there, among those of the second submap; which are keyframes depends on rounding
     number = next(n for n in range(34, FRAMES) if state.records[n].submap == 1 and (n in keyframes) is kept)
@@ -367,9 +374,9 @@ def test_a_frame_is_recognised_in_a_submap_by_its_image(states, frames, kept):
 
 
 def test_a_camera_carried_elsewhere_is_found_in_the_submap_that_knows_the_place(states, frames, truth):
-    after = slam.step(states[-1], frames[37]._replace(number=99, timestamp=99.0), CFG)
+    after, info = slam.step(states[-1], frames[37]._replace(number=99, timestamp=99.0), CFG)
     last = after.records[-1]
-    assert (last.status, last.info.found, last.submap, after.active) == (Status.WEAK, "again", 1, 1)
+    assert (last.status, info.found, last.submap, after.active) == (Status.WEAK, "again", 1, 1)
     assert distance(world_pose(after, last), truth[37])[0] < 0.06  # as the poses of the whole run
     assert len(after.submaps) == 2 and after.motion is None
 
@@ -393,7 +400,7 @@ def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(
 ):
     # Boxes mean nothing there, even if what they hold should fit
     monkeypatch.setattr(
-        territory, "sight", lambda _, place, k, expected, cfg: Sighting(place, expected.T_sub_cam, 1.0)
+        proposals, "sight", lambda _, place, k, expected, cfg: Sighting(place, expected.T_sub_cam, 1.0)
     )
     lost_before = []
     monkeypatch.setattr(
@@ -405,18 +412,19 @@ def test_a_camera_lost_for_long_begins_a_submap_that_hangs_on_nothing(
     before = lost = states[-1]
     # One with hardly any depth is no anchor, and a skipped frame ends no row of lost ones
     for frame in (one, two, three._replace(depth=sparse), four._replace(depth=dark)):
-        lost = slam.step(lost, frame, CFG)
+        lost, _ = slam.step(lost, frame, CFG)
     statuses = [record.status for record in lost.records[-4:]]
     assert statuses == [Status.LOST, Status.LOST, Status.LOST, Status.SKIPPED]
     assert lost_before == [0, 1, 2]
     assert len(lost.submaps) == 2 and lost.active == 0
-    after = lost
+    after, infos = lost, []
     for frame in rest:
-        after = slam.step(after, frame, CFG)
+        after, info = slam.step(after, frame, CFG)
+        infos.append(info)
     first, *others = after.records[len(lost.records) :]
-    assert (first.status, first.info.found, first.info.keyframe) == (Status.WEAK, "nowhere", True)
-    assert {r.status for r in others} == {Status.OK} and not any(r.info.found for r in others)
-    assert sum(r.info.keyframe for r in others) > 1, "these are offered to other submaps"
+    assert (first.status, infos[0].found, first.is_keyframe) == (Status.WEAK, "nowhere", True)
+    assert {r.status for r in others} == {Status.OK} and not any(info.found for info in infos[1:])
+    assert sum(r.is_keyframe for r in others) > 1, "these are offered to other submaps"
     assert len(after.submaps) == 3 and after.active == 2 and after.submap.parent is None
     np.testing.assert_allclose(after.submap.T_world_sub, world_pose(before, before.records[-1]), atol=1e-9)
     assert joined(after, 2) == {2} and joined(after, 0) == {0, 1} and after.loops == ()
@@ -436,7 +444,7 @@ def test_a_camera_found_again_goes_on_in_that_submap(states, monkeypatch, place)
     monkeypatch.setattr(recovery, "recognise", lambda *_: Sighting(place, pose, 0.9))
     found = recovery.find_again(state, state.submap.keyframes[-1], CFG)
     assert found is not None
-    assert found.state.active == place and found.keyframe == 1
+    assert found.state.active == place and found.keyframe is state.submaps[place].keyframes[1]
     kept = [
         after.learned is before.learned
         for before, after in zip(state.submaps, found.state.submaps, strict=True)

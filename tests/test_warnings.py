@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from mipsjax.compilation import CACHE_FROM_S
+from mipsjax.app.compilation import CACHE_FROM_S
 
 TESTS = Path(__file__).parent
 OURS = ["mipsjax", "mipsjax.core.field", *sorted({file.stem for file in TESTS.rglob("*.py")})]
@@ -21,9 +21,9 @@ import mipsjax
 
 cfg = mipsjax.preset("tiny")
 sequence = mipsjax.open_sequence("synth:tiny", frames=slice(0, 3))
-state = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
+state, _ = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
 for position in range(1, len(sequence)):
-    state = mipsjax.step(state, sequence[position], cfg)
+    state, _ = mipsjax.step(state, sequence[position], cfg)
 state = mipsjax.finish(state, cfg)
 assert len(mipsjax.trajectory(state)) == 3
 assert len(mipsjax.reconstruct_mesh(state, cfg).vertices)

@@ -6,8 +6,8 @@ images nor meshes:
     import mipsjax
     cfg = mipsjax.preset("default")
     sequence = mipsjax.open_sequence("synth:room")
-    state = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
-    state = mipsjax.step(state, sequence[1], cfg)
+    state, info = mipsjax.start(sequence[0], sequence.intrinsics, cfg)
+    state, info = mipsjax.step(state, sequence[1], cfg)
     state = mipsjax.finish(state, cfg)
     mesh = mipsjax.reconstruct_mesh(state, cfg)
 """
@@ -15,17 +15,25 @@ images nor meshes:
 from __future__ import annotations
 
 import os
+import sys
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mipsjax.config import Config as Config
+    from mipsjax.config.options import validate as validate
+    from mipsjax.config.presets import PRESETS as PRESETS
+    from mipsjax.config.presets import preset as preset
+    from mipsjax.config.sections import Config as Config
     from mipsjax.core.camera import Intrinsics as Intrinsics
+    from mipsjax.core.field import color as color
+    from mipsjax.core.field import tsdf as tsdf
+    from mipsjax.core.mapping import Frames as Frames
     from mipsjax.core.mapping import Learned as Learned
+    from mipsjax.core.mapping import create as create
     from mipsjax.core.mapping import refine as refine
     from mipsjax.core.particles import fitness as fitness
     from mipsjax.core.tracking import track as track
+    from mipsjax.core.views import Views as Views
     from mipsjax.data.open import open_sequence as open_sequence
     from mipsjax.data.sequence import Frame as Frame
     from mipsjax.data.sequence import Sequence as Sequence
@@ -34,49 +42,76 @@ if TYPE_CHECKING:
     from mipsjax.errors import MipsjaxError as MipsjaxError
     from mipsjax.errors import OutputError as OutputError
     from mipsjax.errors import TrackingLostError as TrackingLostError
-    from mipsjax.final import finish as finish
-    from mipsjax.options import validate as validate
-    from mipsjax.policy import Status as Status
-    from mipsjax.presets import PRESETS as PRESETS
-    from mipsjax.presets import preset as preset
-    from mipsjax.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
-    from mipsjax.slam import start as start
-    from mipsjax.slam import step as step
-    from mipsjax.state import SlamState as SlamState
-    from mipsjax.state import Submap as Submap
-    from mipsjax.state import trajectory as trajectory
+    from mipsjax.mesh.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
+    from mipsjax.slam.finish import finish as finish
+    from mipsjax.slam.info import FrameInfo as FrameInfo
+    from mipsjax.slam.step import start as start
+    from mipsjax.slam.step import step as step
+    from mipsjax.submaps.saved import load as load
+    from mipsjax.submaps.saved import save as save
+    from mipsjax.submaps.state import SlamState as SlamState
+    from mipsjax.submaps.state import Status as Status
+    from mipsjax.submaps.state import Submap as Submap
+    from mipsjax.submaps.state import trajectory as trajectory
 
     __version__: str
 
 # `reconstruct_mesh` is not named after its function, since a package attribute cannot be both that function
 # and the module it is in.
 _PLACES = {
-    "PRESETS": "presets:PRESETS",
-    "Config": "config:Config",
+    "PRESETS": "config.presets:PRESETS",
+    "Config": "config.sections:Config",
     "ConfigError": "errors:ConfigError",
+    "FrameInfo": "slam.info:FrameInfo",
     "Frame": "data.sequence:Frame",
+    "Frames": "core.mapping:Frames",
     "InputError": "errors:InputError",
     "Learned": "core.mapping:Learned",
     "Intrinsics": "core.camera:Intrinsics",
     "MipsjaxError": "errors:MipsjaxError",
     "OutputError": "errors:OutputError",
     "Sequence": "data.sequence:Sequence",
-    "SlamState": "state:SlamState",
-    "Status": "policy:Status",
-    "Submap": "state:Submap",
+    "SlamState": "submaps.state:SlamState",
+    "Status": "submaps.state:Status",
+    "Submap": "submaps.state:Submap",
     "TrackingLostError": "errors:TrackingLostError",
+    "Views": "core.views:Views",
+    "color": "core.field:color",
+    "create": "core.mapping:create",
+    "tsdf": "core.field:tsdf",
     "fitness": "core.particles:fitness",
+    "load": "submaps.saved:load",
     "open_sequence": "data.open:open_sequence",
-    "preset": "presets:preset",
-    "reconstruct_mesh": "reconstruct:reconstruct",
+    "preset": "config.presets:preset",
+    "reconstruct_mesh": "mesh.reconstruct:reconstruct",
     "refine": "core.mapping:refine",
-    "finish": "final:finish",
-    "start": "slam:start",
-    "step": "slam:step",
+    "finish": "slam.finish:finish",
+    "save": "submaps.saved:save",
+    "start": "slam.step:start",
+    "step": "slam.step:step",
     "track": "core.tracking:track",
-    "trajectory": "state:trajectory",
-    "validate": "options:validate",
+    "trajectory": "submaps.state:trajectory",
+    "validate": "config.options:validate",
 }
+
+
+def _is_door() -> bool:
+    """Whether Python is on the way to a program of this package, as with `python -m mipsjax.run`."""
+    behind = zip(sys.orig_argv, sys.orig_argv[1:], strict=False)
+    ours = any(option == "-m" and name.startswith("mipsjax.") for option, name in behind)
+    # Python puts this there until it has found the module
+    return ours and sys.argv[:1] == ["-m"]
+
+
+if _is_door():
+    # What is imported below and later takes seconds, in which Ctrl-C would be swallowed or print a traceback
+    import_module("mipsjax.app.signals").end_at_once()
+
+
+def _version(package: str) -> str:
+    from importlib.metadata import version  # takes longer than all else here
+
+    return version(package)
 
 
 # Their fusions with the YNN library read freed memory on CPUs (jax issue 39257): a pose comes out wrong, NaN, or
@@ -98,12 +133,12 @@ def _check_jaxlib(found: str, flags: str) -> None:
 # not fit the processor, although it does. Errors that matter are raised.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-_check_jaxlib(version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
+_check_jaxlib(_version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return version("mipsjax")
+        return _version("mipsjax")
     if name not in _PLACES:
         raise AttributeError(f"module 'mipsjax' has no attribute '{name}'")
     module, attribute = _PLACES[name].split(":")

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mipsjax.config import Config, FieldConfig, KeyframeConfig, LossConfig, MapConfig, SampleConfig
-from mipsjax.config_tracking import RefineConfig, SearchConfig, TrackConfig
+from mipsjax.config.sections import Config, FieldConfig, KeyframeConfig, LossConfig, MapConfig, SampleConfig
+from mipsjax.config.tracking import RefineConfig, SearchConfig, TrackConfig
 from mipsjax.core.camera import Intrinsics
 
 CAMERA = Intrinsics(105.0, 105.0, 63.5, 47.5, 128, 96)

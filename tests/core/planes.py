@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mipsjax.config import Config, FieldConfig
+from mipsjax.config.sections import Config, FieldConfig
 from mipsjax.core import field as nf
 
 CFG = Config(field=FieldConfig(encoding="frequency", octaves=1, hidden=(), color_hidden=()))

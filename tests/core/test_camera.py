@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, project, rays, transform
+from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, project, rays, unproject
+from mipsjax.core.rigid import transform
 
 CAMERA = Intrinsics(52.5, 51.3, 31.2, 22.9, 64, 48)
 # Rays are quotients of numbers below 100 in float32: a few units in the last place
@@ -64,6 +65,24 @@ def test_projection_undoes_unprojection(u, v, depth):
     point = rays(jnp.array([v]), jnp.array([u]), CAMERA) * depth
     # A pixel number below 64 has a unit in the last place of 4e-6; four operations
     np.testing.assert_allclose(project(point, CAMERA)[0], [u, v], atol=2e-5)
+
+
+def test_the_host_and_compiled_code_unproject_and_project_alike():
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].reshape(2, -1)
+    depth = np.linspace(0.5, 4.0, len(u))
+    p_cam = unproject(v, u, depth, CAMERA)
+    assert p_cam.dtype == np.float64 and isinstance(project(p_cam, CAMERA), np.ndarray)
+    np.testing.assert_allclose(project(p_cam, CAMERA), np.stack([u, v], 1), atol=1e-12)
+    compiled = jax.jit(lambda v, u, d: unproject(v, u, d, CAMERA))(v, u, depth)
+    assert compiled.dtype == np.float32
+    # A few units in the last place of coordinates below 4 m
+    np.testing.assert_allclose(compiled, p_cam, atol=2e-6)
+
+
+def test_the_matrix_of_a_camera_projects():
+    p_cam = np.array([[0.3, -0.2, 1.7], [-0.5, 0.1, 0.6]])
+    u, v, w = CAMERA.matrix() @ p_cam.T
+    np.testing.assert_allclose(project(p_cam, CAMERA), np.stack([u / w, v / w], 1), atol=1e-12)
 
 
 def test_points_at_or_behind_the_camera_project_to_something_finite():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,12 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from mipsjax.config import FieldConfig
+from mipsjax.config.presets import PRESETS
+from mipsjax.config.sections import Encoding, FieldConfig
 from mipsjax.core import field as nf
-from mipsjax.presets import PRESETS
+from mipsjax.core.encodings import ENCODINGS
+from mipsjax.core.encodings.hashgrid import hash_features
+from mipsjax.core.encodings.sinusoids import frequencies
 
 SMALL = FieldConfig(
     encoding="both",
@@ -54,6 +58,18 @@ def saying(outputs, cfg: FieldConfig) -> nf.Field:
 
     field = nf.init(KEY, cfg)
     return field._replace(smooth=constant(field.smooth), fine=constant(field.fine))
+
+
+def test_every_encoding_that_can_be_chosen_is_in_the_table():
+    assert ENCODINGS.keys() == set(get_args(Encoding))
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_an_encoding_is_as_wide_as_it_says(name):
+    cfg = replace(SMALL, encoding=name)
+    for encoding in [e for e in ENCODINGS[name] if e is not None]:
+        encoded = encoding.apply(encoding.init(KEY, cfg), POINTS, cfg)
+        assert encoded.shape == (len(POINTS), encoding.width(cfg))
 
 
 @pytest.mark.parametrize("factor", [1.0, 10.0, 1e4])
@@ -104,7 +120,7 @@ def test_colors_are_between_0_and_1(field):
 def test_the_parts_of_a_double_field(field):
     search, whole = nf.tsdf(field, POINTS, SMALL, "search"), nf.tsdf(field, POINTS, SMALL, "whole")
     np.testing.assert_array_equal(search.psi, nf.smooth_tsdf(field, POINTS, SMALL).psi)
-    np.testing.assert_array_equal(whole.psi, nf.fine_tsdf(field, POINTS, SMALL).psi)
+    np.testing.assert_array_equal(whole.psi, nf.tsdf(field, POINTS, SMALL).psi)
 
 
 @pytest.mark.parametrize("encoding", ["frequency", "hash", "joint"])
@@ -135,7 +151,7 @@ def test_parameters_depend_on_the_key_alone(field):
 
 
 def test_sinusoids_against_double_precision():
-    encoded = np.asarray(nf.frequencies(POINTS, SMALL), np.float64)
+    encoded = np.asarray(frequencies(POINTS, SMALL), np.float64)
     assert encoded.shape == (len(POINTS), 3 + 6 * SMALL.octaves)
     np.testing.assert_array_equal(encoded[:, :3], POINTS)
     for octave in range(SMALL.octaves):
@@ -149,7 +165,7 @@ def test_sinusoids_against_double_precision():
 
 def test_derivatives_of_the_sinusoids():
     def total(points):
-        return jnp.sum(nf.frequencies(points, SMALL)[:, 3:9], -1)  # of the first octave
+        return jnp.sum(frequencies(points, SMALL)[:, 3:9], -1)  # of the first octave
 
     slope = 2 * np.pi / SMALL.longest_wavelength
     points = POINTS.astype(np.float64)
@@ -189,7 +205,7 @@ def random_table(cfg: FieldConfig) -> np.ndarray:
 def test_hash_features_against_plain_python():
     table = random_table(SMALL)
     cells = np.geomspace(SMALL.hash_coarsest, SMALL.hash_finest, SMALL.hash_levels)
-    encoded = np.asarray(nf.hash_features(table, POINTS, SMALL))
+    encoded = np.asarray(hash_features(table, POINTS, SMALL))
     for point, row in zip(POINTS[:60], encoded, strict=False):
         expected = [trilinear(level, point, cell) for level, cell in zip(table, cells, strict=True)]
         # The order of the features within a row is the encoding's own affair. A coordinate is up to 40 cells:
@@ -205,7 +221,7 @@ ONE_LEVEL = replace(
 def test_a_corner_of_a_cell_has_the_features_of_its_entry():
     table = random_table(ONE_LEVEL)
     corners = np.array(list(product((-3, 0, 5), repeat=3)))
-    encoded = nf.hash_features(table, (corners * 0.25).astype(np.float32), ONE_LEVEL)
+    encoded = hash_features(table, (corners * 0.25).astype(np.float32), ONE_LEVEL)
     expected = [table[0, entry(corner, table.shape[1])] for corner in corners]
     np.testing.assert_allclose(encoded, expected, atol=1e-6)
 
@@ -217,7 +233,7 @@ def test_hash_features_are_continuous_across_cell_borders(axis, border):
     before = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
     after = before.copy()
     before[:, axis], after[:, axis] = border - step, border + step
-    jump = nf.hash_features(table, after, ONE_LEVEL) - nf.hash_features(table, before, ONE_LEVEL)
+    jump = hash_features(table, after, ONE_LEVEL) - hash_features(table, before, ONE_LEVEL)
     steepest = np.ptp(table) / 0.25
     assert np.abs(jump).max() <= 2 * step * steepest + 1e-6
 
@@ -226,11 +242,11 @@ def test_the_gradient_of_hash_features_is_numerical():
     table, step = random_table(ONE_LEVEL), 0.01
     cell = np.random.default_rng(3).integers(-6, 6, (40, 3))
     points = (0.25 * (cell + np.random.default_rng(4).uniform(0.1, 0.9, (40, 3)))).astype(np.float32)
-    gradient = jax.grad(lambda p: jnp.sum(nf.hash_features(table, p, ONE_LEVEL)))(points)
+    gradient = jax.grad(lambda p: jnp.sum(hash_features(table, p, ONE_LEVEL)))(points)
     for axis in range(3):
         shift = np.zeros(3, np.float32)
         shift[axis] = step
-        rise = nf.hash_features(table, points + shift, ONE_LEVEL) - nf.hash_features(
+        rise = hash_features(table, points + shift, ONE_LEVEL) - hash_features(
             table, points - shift, ONE_LEVEL
         )
         # Linear along each axis within a cell, so that only rounding separates the two: 1e-6 over 0.02
@@ -238,7 +254,7 @@ def test_the_gradient_of_hash_features_is_numerical():
 
 
 def test_the_gradient_of_the_table_shares_one_among_eight_corners():
-    gradient = jax.grad(lambda t: jnp.sum(nf.hash_features(t, POINTS[:1], SMALL)))(random_table(SMALL))
+    gradient = jax.grad(lambda t: jnp.sum(hash_features(t, POINTS[:1], SMALL)))(random_table(SMALL))
     np.testing.assert_allclose(gradient.sum(1), np.ones((SMALL.hash_levels, SMALL.hash_features)), rtol=1e-5)
     assert gradient.min() >= 0 and ((gradient > 0).sum(1) <= 8).all()
 
@@ -265,6 +281,6 @@ def test_the_gradient_of_the_table_is_the_transpose_of_reading_it(feature):
     weight = np.random.default_rng(5).normal(size=(len(POINTS), SMALL.hash_levels * SMALL.hash_features))
     table, change = random_table(SMALL), np.zeros_like(random_table(SMALL))
     change[..., feature] = np.random.default_rng(6).normal(size=change.shape[:2])
-    gradient = jax.grad(lambda t: jnp.sum(weight * nf.hash_features(t, POINTS, SMALL)))(table)
-    read = weight * nf.hash_features(change, POINTS, SMALL)
+    gradient = jax.grad(lambda t: jnp.sum(weight * hash_features(t, POINTS, SMALL)))(table)
+    read = weight * hash_features(change, POINTS, SMALL)
     np.testing.assert_allclose(np.sum(gradient * change), np.sum(read), rtol=1e-4, atol=1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import expit, log_softmax
 
-from mipsjax.config import FieldConfig
+from mipsjax.config.sections import FieldConfig
 from mipsjax.core import losses
 from mipsjax.core.field import Tsdf
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.compilation import enable_cache
+from mipsjax.app.compilation import enable_cache
+from mipsjax.config.presets import PRESETS
 from mipsjax.core import mapping
 from mipsjax.core.camera import Intrinsics
-from mipsjax.presets import PRESETS
 
 pytestmark = pytest.mark.slow
 

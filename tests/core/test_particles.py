@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from mipsjax.config import FieldConfig
-from mipsjax.config_tracking import SearchConfig
+from mipsjax.config.sections import FieldConfig
+from mipsjax.config.tracking import SearchConfig
 from mipsjax.core import field as nf
 from mipsjax.core import particles
 from mipsjax.core.particles import Swarm
@@ -131,9 +131,21 @@ def test_fitness_does_not_depend_on_the_other_poses(wall, plane_points, monkeypa
     poses = poses_around(TRUTH, 700)
     alone = jnp.stack([particles.pose_cost(wall, T, plane_points, MASK, FIELD, SEARCH) for T in poses[::100]])
     monkeypatch.setattr(particles, "CHUNK_POINTS", chunk * PIXELS)
-    costs = particles.fitness(wall, poses, plane_points, MASK, FIELD, SEARCH)
+    # Traced anew: the size of a chunk is a constant of the compiled program
+    fitness = particles.fitness.__wrapped__
+    costs = fitness(wall, poses, plane_points, MASK, FIELD, SEARCH)
     # Sums of 20 float32 numbers in another order, as above
     np.testing.assert_allclose(costs[::100], alone, rtol=1e-5, atol=1e-13)
+
+
+def test_on_a_gpu_all_particles_are_one_batch(wall, plane_points):
+    poses = poses_around(TRUTH, 2 * particles.CHUNK_POINTS // PIXELS)
+    traced = particles.fitness.trace(wall, poses, plane_points, MASK, FIELD, SEARCH)
+    on_cpu, on_gpu = (traced.lower(lowering_platforms=(name,)).as_text() for name in ("cpu", "cuda"))
+    # A loop over chunks on the one, no loop on the other; and no product in less than single precision on either
+    assert "stablehlo.while" in on_cpu and "stablehlo.while" not in on_gpu
+    products = [line for line in on_gpu.splitlines() if "dot_general" in line]
+    assert products and all("HIGHEST" in line for line in products)
 
 
 def test_fitness_without_a_point_is_finite(wall, plane_points):

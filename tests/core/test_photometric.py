@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core.camera import project, rays
 from mipsjax.core.equations import Points, System, descend
 from mipsjax.core.photometric import (

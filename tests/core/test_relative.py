@@ -13,12 +13,12 @@ from corner import CAMERA, HOME, apart, pose, see
 from jaxtyping import Array, Float
 
 import painted
-from mipsjax.config import Config, PairConfig
+from mipsjax.config.sections import Config, PairConfig
 from mipsjax.core import relative
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.photometric import Images
 from mipsjax.core.solvers import Landmarks
-from mipsjax.host.trust import ALLOWED, of_pair
+from mipsjax.uncertainty.trust import ALLOWED, of_pair
 
 CFG = replace(Config(), pairs=PairConfig(pixels=2304))
 MOTION = pose((2.0, -3.0, 1.0), (0.06, -0.04, 0.05))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.config import SampleConfig
+from mipsjax.config.sections import SampleConfig
 from mipsjax.core import sampling
 
 TAU = 0.1

@@ -16,8 +16,8 @@ from planes import plane
 
 from mipsjax.core import equations, losses, solvers, tracking
 from mipsjax.core import field as nf
-from mipsjax.core.camera import transform
 from mipsjax.core.photometric import Images
+from mipsjax.core.rigid import transform
 from mipsjax.core.views import Views, own_normals
 
 pytestmark = pytest.mark.slow

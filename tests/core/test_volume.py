@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mipsjax.config_submaps import VolumeConfig
+from mipsjax.config.submaps import VolumeConfig
 from mipsjax.core import volume
-from mipsjax.core.volume import Box, contained, grow, inside, moved, seen
+from mipsjax.core.rigid import transform
+from mipsjax.core.volume import Box, contained, grow, inside, seen
 
 CFG = VolumeConfig(governs="depth", far=5.0, max_side=7.0, margin=0.0)
 ROUNDING = 1e-12  # metres; coordinates are below 100 m, with 2e-14 in the last place
@@ -141,10 +142,10 @@ def test_nothing_is_seen_without_depth(governs):
 def test_depth_and_surface_end_at_the_measured_surface():
     """The corner of a room: its walls are the farthest that is seen, and all points on them by `surface`."""
     surface, depth = (seen(see(HOME)[0], CAMERA, replace(CFG, governs=g)) for g in ("surface", "depth"))
-    on_walls = np.abs(moved(HOME, surface.p_cam) - [-1.2, 0.9, 2.0]).min(1)
+    on_walls = np.abs(transform(HOME, surface.p_cam) - [-1.2, 0.9, 2.0]).min(1)
     assert surface.mask.all() and on_walls.max() < 1e-5  # depth is in single precision
     np.testing.assert_allclose(depth.p_cam.reshape(-1, volume.DEPTHS, 3)[:, -1], surface.p_cam)
-    within = moved(HOME, depth.p_cam)
+    within = transform(HOME, depth.p_cam)
     assert (within[:, 0] > -1.2001).all() and (within[:, 1] < 0.9001).all() and (within[:, 2] < 2.0001).all()
 
 

@@ -94,3 +94,36 @@ def test_camera_file_fills_what_options_leave_open(tmp_path: Path) -> None:
 def test_frame_rate() -> None:
     assert frame_rate(Options(fps=60.0)) == (60.0, ())
     assert frame_rate(Options()) == (30.0, ("no times known: frames taken to be 1/30 s apart",))
+
+
+NAN, HUGE = float("nan"), 10**400
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        [65, 65, 40, 30, NAN, NAN],
+        [65, 65, 40, 30, 0, 0],
+        [65, 65, 40, 30, HUGE, HUGE],
+        [65, 65, 40, 30, 1e9, 1e9],
+        [NAN, 65, 40, 30],
+        [65, HUGE, 40, 30],
+        [65, 65, 40, 30, 80],
+    ],
+)
+def test_numbers_that_are_no_intrinsics(numbers: list[float]) -> None:
+    with pytest.raises(ConfigError, match="--intrinsics"):
+        declared_intrinsics(numbers)
+
+
+@pytest.mark.parametrize("focal", [1e9, 2500, 7, 1e-300])
+def test_a_focal_length_that_no_camera_has(focal: float) -> None:
+    with pytest.raises(InputError, match="no camera has such a focal length"):
+        resolve_intrinsics(declared_intrinsics([focal, focal, 40, 30]), (80, 60), (80, 60))
+
+
+@pytest.mark.parametrize("key", ["width", "height", "fps", "depth_scale"])
+def test_values_of_a_camera_file_have_bounds(key: str) -> None:
+    for value in (0, 1e300, 1e-300):
+        with pytest.raises(InputError, match=key):
+            read(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 9, "height": 9} | {key: value}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,22 @@ def test_any_bytes_are_no_seq_file(tmp_path_factory: pytest.TempPathFactory, con
         assert "a.seq" in str(error)
     else:
         assert len(source) > 0
+
+
+def test_seq_file_cut_while_it_is_read(tmp_path: Path) -> None:
+    path = write_seq(tmp_path / "office.seq")
+    sequence = fastcamo.read(path, OPTIONS)
+    assert sequence[FRAMES - 1].depth is not None
+    path.write_bytes(path.read_bytes()[:-5])
+    frame = sequence[FRAMES - 1]
+    assert frame.color is None and frame.depth is not None and "cut short" in frame.problem
+    path.unlink()
+    assert "unreadable_depth" in sequence[0].problem
+
+
+def test_seq_file_with_a_forged_header(tmp_path: Path) -> None:
+    path = tmp_path / "forged.seq"
+    np.array([3, 16384, 16384], "<i4").tofile(path)
+    os.truncate(path, 12 + 3 * 5 * 16384**2)  # takes no room
+    with pytest.raises(InputError, match="16384 x 16384 pixels"):
+        fastcamo.read(path, OPTIONS)

@@ -14,9 +14,11 @@ from mipsjax.data.framefiles import (
     list_files,
     numbered_times,
     pair_by_name,
+    require_images,
     rows_for_frames,
 )
 from mipsjax.data.trajectory import known_poses
+from mipsjax.errors import InputError
 
 
 def keys(*names: str) -> list:
@@ -73,3 +75,14 @@ def test_listing_leaves_out_hidden_and_other_files(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert [path.name for path in list_files(tmp_path, (".png",))] == ["1.PNG", "2.png"]
     assert list_files(tmp_path / "none", (".png",)) == []
+
+
+def test_numbers_of_many_digits_are_as_many_times() -> None:
+    keys = [frame_key(str(10**20 + number)) for number in range(4)]
+    np.testing.assert_array_equal(numbered_times(keys, 10.0), np.arange(4) / 10)
+
+
+def test_colour_and_depth_of_other_names_are_refused(tmp_path: Path) -> None:
+    _, files = pair_by_name([tmp_path / "a1.png"], [tmp_path / "b1.png"], lambda path: path.stem)
+    with pytest.raises(InputError, match=r"a1\.png and b1\.png"):
+        require_images(files, tmp_path, "*.png")

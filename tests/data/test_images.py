@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -174,3 +177,47 @@ def test_depth_is_in_range_or_zero(raw: np.ndarray, units: float) -> None:
     depth = depth_to_metres(raw, units, 0.1, 8.0)
     assert depth.dtype == np.float32
     assert np.all((depth == 0) | ((depth >= np.float32(0.1)) & (depth <= 8)))
+
+
+@pytest.mark.parametrize(("reader", "kind"), [(read_color, "color"), (read_raw_depth, "depth")])
+def test_only_regular_files_of_a_possible_size_are_read(tmp_path: Path, reader, kind: str) -> None:
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "forged.png").write_bytes(with_size(16384, 16384))
+    (tmp_path / "bitmap.png").write_bytes(cv2.imencode(".bmp", color_image(0))[1].tobytes())
+    expected = {
+        "pipe.png": "no regular file",
+        "forged.png": "16384 x 16384 pixels",
+        "bitmap.png": "neither PNG nor JPEG",
+        "nul\0.png": "no name of a file",
+    }
+    for name, reason in expected.items():
+        image, found = reader(tmp_path / name)
+        assert image is None and found.startswith(f"unreadable_{kind}") and reason in found
+    assert read_header(tmp_path / "pipe.png") is None and read_header(tmp_path / "nul\0.png") is None
+    assert "no regular file" in reader(Path("/dev/zero"))[1]
+
+
+@pytest.mark.parametrize("size", [(0, 48), (64, 0)])
+def test_an_image_without_pixels_has_no_header(size: tuple[int, int]) -> None:
+    assert parse_header(with_size(*size)) is None
+
+
+def with_size(width: int, height: int) -> bytes:
+    """A PNG whose header claims a size, with the checksum of the claim."""
+    data = bytearray(cv2.imencode(".png", depth_image(0))[1].tobytes())
+    data[16:24] = struct.pack(">II", width, height)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+def test_what_is_no_pixel_is_left_out_before_libpng_complains(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = cv2.imencode(".png", depth_image(0))[1].tobytes()
+    profile = b"iCCPbroken\0\0no profile"
+    chunk = struct.pack(">I", len(profile) - 4) + profile + struct.pack(">I", zlib.crc32(profile))
+    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
+    depth, reason = read_raw_depth(tmp_path / "a.png")
+    assert depth is not None and reason == ""
+    np.testing.assert_array_equal(depth, depth_image(0))
+    assert capfd.readouterr().err == ""

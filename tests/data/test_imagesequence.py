@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from write_layouts import CAMERA, FRAMES, color_image, depth_image, pose, write_folder, write_image
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.calibration import Calibration, Options
 from mipsjax.data.folder import read

@@ -24,7 +24,7 @@ from write_layouts import (
     write_tum,
 )
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.data.imagesequence import ImageSequence
 from mipsjax.data.open import (
     LAYOUTS,

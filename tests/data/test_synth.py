@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
+from mipsjax.data.synth import __main__ as synth_main
 from mipsjax.data.synth import open_synth
 from mipsjax.data.synth.__main__ import main
 from mipsjax.data.synth.build import assemble, ball, block, hollow, post
@@ -473,3 +474,22 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["tiny", str(tmp_path / "new"), "--voxel", "small"]) == ConfigError.exit_code
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 5 and all(line.startswith("error: ") for line in errors)
+
+
+@pytest.mark.parametrize("voxel", ["0", "-1", "nan", "inf", "1e-9", "1e9"])
+def test_export_refuses_cells_of_no_size(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], voxel: str
+) -> None:
+    assert main(["tiny", str(tmp_path / "new"), f"--voxel={voxel}"]) == ConfigError.exit_code
+    assert "--voxel" in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+def test_export_that_is_interrupted_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(synth_main, "export_tum", interrupted)
+    assert main(["tiny", str(tmp_path / "new")]) == 130
+    assert capsys.readouterr().err == "interrupted: the folder is not whole\n"

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.data.synth import open_synth, synth_names
 from mipsjax.data.synth.catalog import Spec, find
 from mipsjax.data.synth.draws import Draws

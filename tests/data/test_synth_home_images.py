@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.data.synth import open_synth
 from mipsjax.data.synth.__main__ import main
 from mipsjax.data.synth.catalog import QVGA
@@ -18,7 +18,7 @@ from mipsjax.data.synth.home import home
 from mipsjax.data.synth.home_plan import home_plan
 from mipsjax.data.synth.mesh import reference_mesh
 from mipsjax.data.synth.render import render
-from mipsjax.host.surface import Views, observed
+from mipsjax.metrics.surface import Views, observed
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.synth import open_synth
 from mipsjax.data.synth.apartment import apartment

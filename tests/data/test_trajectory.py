@@ -20,6 +20,8 @@ from mipsjax.data.trajectory import (
     quaternion_from_matrix,
     read_matrix_files,
     read_matrix_rows,
+    read_true_matrices,
+    read_true_tum,
     read_tum,
     write_tum,
 )
@@ -168,7 +170,7 @@ def test_what_is_no_rotation_is_rejected() -> None:
     np.testing.assert_array_equal(known_poses(poses), [False] * 5 + [True])
     assert notes == (
         "traj.txt: 1 of 6 true poses are not finite, left unknown",
-        "traj.txt: 4 of 6 true poses rejected, left unknown (mirrored or not rigid)",
+        "traj.txt: 4 of 6 true poses rejected, left unknown (mirrored, not rigid, or farther than 1e+08 m)",
     )
 
 
@@ -193,3 +195,40 @@ def test_published_rotations_are_not_orthonormal_but_ours_are(shared_data: Path)
     assert poses is not None and notes == ()
     gram = poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2)
     np.testing.assert_allclose(gram, np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-14)
+
+
+def test_positions_beyond_the_earth_are_unknown(tmp_path: Path) -> None:
+    matrices = random_poses(3)
+    matrices[1, 0, 3], matrices[2, 0, 3] = 1e308, 1e7
+    poses, notes = clean_poses(matrices, "traj.txt")
+    np.testing.assert_array_equal(known_poses(poses), [True, False, True])
+    assert "1 of 3 true poses rejected" in notes[0]
+    (tmp_path / "truth.txt").write_text("0 1e308 0 0 0 0 0 1\n1 1e7 0 0 0 0 0 1\n")
+    np.testing.assert_array_equal(known_poses(read_tum(tmp_path / "truth.txt").T_world_cam), [False, True])
+
+
+def test_truth_never_stops_a_run(tmp_path: Path) -> None:
+    """A cut line is an unknown pose there, and an error where the file is what is asked about."""
+    path = tmp_path / "truth.txt"
+    path.write_text("0 1 0 0 0 0 0 1\n1 2 0 0 0 0 0 1\n2 3 0")
+    found, remarks = read_true_tum(path)
+    np.testing.assert_array_equal(found.T_world_cam[:, 0, 3], [1, 2])
+    assert len(remarks) == 1 and "1 of 3 rows" in remarks[0] and "line 3" in remarks[0]
+    with pytest.raises(InputError, match="line 3"):
+        read_tum(path)
+    identity = " ".join(str(number) for number in np.eye(4).ravel())
+    path.write_text(f"{identity}\nno pose\n{identity}\n")
+    poses, remarks = read_true_matrices(path)
+    np.testing.assert_array_equal(known_poses(poses), [True, False, True])
+    assert "1 of 3 rows are malformed" in remarks[0]
+    for unreadable in (tmp_path, tmp_path / "nothing"):
+        poses, remarks = read_true_matrices(unreadable)
+        assert len(poses) == 0 and "truth left out" in remarks[0]
+
+
+def test_true_rows_without_the_last_row_of_each_matrix(tmp_path: Path) -> None:
+    poses = random_poses(3)
+    np.savetxt(tmp_path / "poses.txt", poses[:, :3].reshape(3, 12))
+    found, remarks = read_true_matrices(tmp_path / "poses.txt")
+    np.testing.assert_allclose(found, poses, atol=1e-12)
+    assert remarks == ()

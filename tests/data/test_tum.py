@@ -197,3 +197,31 @@ def test_real_excerpt(shared_data: Path) -> None:
     frame = sequence[20]
     assert frame.problem == "" and frame.depth is not None and frame.color is not None
     assert 1.0 < np.median(frame.depth[frame.depth > 0]) < 4.0
+
+
+def test_the_list_of_colour_may_have_its_other_name(root: Path) -> None:
+    expected = tum.read(root, OPTIONS)
+    (root / "rgb.txt").rename(root / "color.txt")
+    assert tum.matches(root) and len(tum.read(root, OPTIONS)) == len(expected)
+
+
+def test_times_in_whole_seconds_are_refused(root: Path) -> None:
+    rows = [line.split() for line in (root / "depth.txt").read_text().splitlines() if line[0] != "#"]
+    (root / "depth.txt").write_text("".join(f"{float(time):.0f} {name}\n" for time, name in rows))
+    with pytest.raises(InputError, match="fractions of a second"):
+        tum.read(root, OPTIONS)
+
+
+def test_a_cut_line_of_truth_stops_nothing(root: Path) -> None:
+    path = root / "groundtruth.txt"
+    path.write_text(path.read_text().rstrip()[:-9])
+    sequence = tum.read(root, OPTIONS)
+    assert sequence.T_world_cam is not None and any("malformed" in note for note in sequence.notes)
+
+
+def test_names_with_a_nul_are_missing_images(root: Path) -> None:
+    path = root / "depth.txt"
+    lines = path.read_text().splitlines()
+    lines[-1] = lines[-1] + "\0.png"
+    path.write_text("\n".join(lines))
+    assert "unreadable_depth" in tum.read(root, OPTIONS)[FRAMES - 1].problem

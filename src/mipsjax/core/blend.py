@@ -6,18 +6,17 @@ parameters and pose are arguments like any other, so that one compilation serves
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mipsjax.config import Config, FieldConfig
+from mipsjax.config.sections import Config, FieldConfig
 from mipsjax.core import field as nf
 from mipsjax.core import losses
-from mipsjax.core.camera import transform
+from mipsjax.core.compiled import compiled
+from mipsjax.core.rigid import transform
 
 
 class Blended(NamedTuple):
@@ -39,7 +38,7 @@ def start(points: int, cfg: FieldConfig) -> Blended:
     return Blended(psi, entropy, jnp.zeros((points, 3)), jnp.zeros(points))
 
 
-@partial(jax.jit, static_argnames=("cfg", "colored"))
+@compiled("cfg", "colored")
 def add(
     total: Blended,
     field: nf.Field,
@@ -56,16 +55,16 @@ def add(
     Without `colored` the colour stays as it is, for less work.
     """
     encoded = nf.encode(field, transform(T_sub_world, p_world), cfg.field)
-    net = field.smooth if field.fine is None else field.fine
-    assert net is not None
-    psi, entropy, _ = nf.classify(net, encoded, cfg.field)
+    psi, entropy, _ = nf.decode_tsdf(field, encoded, cfg.field)
     weight = trust * losses.certainty(entropy, cfg.blend.entropy_floor)
     used = (weight > 0) & jnp.isfinite(psi)
     together = total.weight + jnp.where(used, weight, 0.0)
+    # Guarded twice: the branch that is not taken must not divide by 0 either
     share = jnp.where(used, weight / jnp.where(used, together, 1.0), 0.0)
 
     def mean(old, new):
         by = share.reshape(-1, *[1] * (old.ndim - 1))
+        # As a mean of both and not old + by (new - old): a submap alone then gives its own bits
         return jnp.where(by > 0, (1 - by) * old + by * new, old)
 
     color = mean(total.color, nf.decode_color(field, encoded)) if colored else total.color

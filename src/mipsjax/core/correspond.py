@@ -10,7 +10,6 @@ Every step is therefore Newton's, which divides by the squared norm and is the p
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
-from mipsjax.core.camera import transform
+from mipsjax.core.compiled import compiled
+from mipsjax.core.rigid import transform, transform_back
 from mipsjax.core.solvers import SATURATED
 
 
@@ -57,13 +57,14 @@ def fixed_size(
 ) -> tuple[Float32[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
     """Any number of points as N = `cfg.correspond.points` and a mask: evenly thinned out, or padded."""
     count = cfg.correspond.points
+    # Even over the list, and so over keyframes and their images, from which it was joined
     kept = np.linspace(0, len(points) - 1, min(count, len(points))).round().astype(int)
     start, mask = np.zeros((count, 3), np.float32), np.arange(count) < len(points)
     start[: len(kept)] = points[kept]
     return start, mask
 
 
-@partial(jax.jit, static_argnames="cfg")
+@compiled("cfg")
 def surface_points(
     field: nf.Field, start: Float[Array, "N 3"], mask: Bool[Array, " N"], cfg: Config
 ) -> Surface:
@@ -79,7 +80,7 @@ def surface_points(
     return Surface(_where(good, there), _where(good, _unit(here.gradient)), good)
 
 
-@partial(jax.jit, static_argnames="cfg")
+@compiled("cfg")
 def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg: Config) -> Matches:
     """Correspondences of submap j's surface points on submap k's surface (Eq. 19, by Newton steps).
 
@@ -94,6 +95,7 @@ def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg
     q_k = _descend(field_k, start, cfg.correspond.match_steps, cfg)
     after = _local(field_k, q_k, cfg)
     normal_j = surface_j.normals @ T_k_j[:3, :3].T
+    # The two sides of a thin wall are within the truncation of each other: only the normals tell them apart
     agree = jnp.sum(normal_j * _unit(after.gradient), -1) > np.cos(cfg.correspond.max_angle)
     distance = jnp.sqrt(jnp.sum((q_k - start) ** 2, -1))
     near = distance < cfg.field.truncation
@@ -104,7 +106,7 @@ def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg
 
 def residuals(surface_j: Surface, matches: Matches, T_k_j: Float[Array, "4 4"]) -> Float[Array, " N"]:
     """Point-to-plane errors e_i = (p_j - T_j_k q_k) . n_j of Eq. 20, metres; 0 where there is no match."""
-    q_j = (matches.q_k - T_k_j[None, :3, 3]) @ T_k_j[:3, :3]
+    q_j = transform_back(T_k_j, matches.q_k)
     error = jnp.sum((surface_j.points - q_j) * surface_j.normals, -1)
     return jnp.where(matches.mask, error, 0.0)
 
@@ -114,6 +116,7 @@ def _local(field: nf.Field, points: Float[Array, "N 3"], cfg: Config) -> Local:
         prediction = nf.tsdf(field, p, cfg.field)
         return prediction.psi, prediction.entropy
 
+    # One reverse pass gives the gradient at all points: each psi depends on its own point alone
     psi, pull, entropy = jax.vjp(distance, points, has_aux=True)
     return Local(psi, pull(jnp.ones_like(psi))[0], entropy)
 
@@ -123,6 +126,7 @@ def _descend(field: nf.Field, points: Float[Array, "N 3"], steps: int, cfg: Conf
 
     def step(p, _):
         psi, gradient, _ = _local(field, p, cfg)
+        # A flat gradient would throw the point far away
         squared = jnp.maximum(jnp.sum(gradient**2, -1), cfg.correspond.min_gradient**2)
         return p - (psi / squared)[:, None] * gradient, None
 

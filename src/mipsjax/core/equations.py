@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import losses
+from mipsjax.core.rigid import log, perturbed
 
 DAMPING = 1e-3  # first Levenberg-Marquardt factor
 DAMPING_DOWN, DAMPING_UP = 0.3, 4.0
@@ -71,6 +71,7 @@ class Rows(NamedTuple):
     def system(self) -> System:
         """Of all rows together."""
         rows = self.jacobian.reshape(-1, 6)
+        # J^T W, of which both products are made
         weighted = rows.T * self.weight.reshape(-1)[None]
         return System(jnp.sum(self.cost), weighted @ rows, weighted @ self.residual.reshape(-1))
 
@@ -85,7 +86,7 @@ class Prior(NamedTuple):
 
 def prior_system(T: Float[Array, "4 4"], prior: Prior) -> System:
     """Normal equations of how far a pose is from the prior one, for a twist in the camera's frame."""
-    off = jaxlie.SE3.from_matrix(jnp.linalg.inv(prior.T_sub_cam) @ T).log()
+    off = log(jnp.linalg.inv(prior.T_sub_cam) @ T)
     # The derivative of the logarithm is the identity up to half of `off`, which is small where this counts
     slope = prior.weight @ off
     return System(off @ slope, prior.weight, slope)
@@ -109,10 +110,12 @@ def descend(
 
     def step(now: _Descent) -> _Descent:
         hessian = now.here.hessian
+        # Marquardt's scaling by the diagonal, so that metres and radians are damped alike; plus the floor
         damped = hessian + now.damping * jnp.diag(jnp.diag(hessian)) + FLOOR * jnp.eye(6)
         twist = -jnp.linalg.solve(damped, now.here.slope)
-        T_new = now.T @ jaxlie.SE3.exp(twist).as_matrix()
+        T_new = perturbed(now.T, twist)
         there = system(T_new)
+        # A step that makes a cost of NaN is not better, and is left out
         better = there.cost < now.here.cost
         T, here = jax.tree.map(partial(jnp.where, better), (T_new, there), (now.T, now.here))
         damping = now.damping * jnp.where(better, DAMPING_DOWN, DAMPING_UP)

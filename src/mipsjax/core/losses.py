@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import FieldConfig, SensorConfig
+from mipsjax.config.sections import FieldConfig, SensorConfig
 from mipsjax.core.field import Tsdf, class_values
 
 Metres = TypeVar("Metres", np.ndarray, jax.Array)
@@ -50,6 +50,7 @@ def emd(
     if not cfg.classification:
         return jnp.zeros(())
     step = 2 * cfg.truncation / (cfg.classes - 1)
+    # Classes are a step apart: moving all mass to the nearest one costs the sum of steps that it goes
     nearest = jnp.round((target + cfg.truncation) / step)
     away = jnp.abs(jnp.arange(cfg.classes)[None] - nearest[:, None])
     return masked_mean(jnp.sum(jnp.exp(prediction.logits) * away, -1), mask)
@@ -62,6 +63,7 @@ def cross_entropy(
     if not cfg.classification:
         return jnp.zeros(())
     step = 2 * cfg.truncation / (cfg.classes - 1)
+    # Linear between two classes: the mean of the two is the target, where the nearest one alone would round it
     two_hot = jnp.maximum(0, 1 - jnp.abs(target[:, None] - class_values(cfg)[None]) / step)
     return masked_mean(-jnp.sum(two_hot * prediction.logits, -1), mask)
 
@@ -70,6 +72,7 @@ def render_weights(
     psi: Float[Array, "P S"], near: Bool[Array, "P S"], truncation: float
 ) -> Float[Array, "P S"]:
     """Normalised weights of the samples of each ray, in the truncation region only (Eqs. 3 and 4)."""
+    # Largest where psi is 0, and the same on both sides: the weights have a mode at the surface (Eq. 3)
     raw = jax.nn.sigmoid(psi / truncation) * jax.nn.sigmoid(-psi / truncation) * near
     return raw / jnp.maximum(jnp.sum(raw, -1, keepdims=True), 1e-6)
 
@@ -83,4 +86,5 @@ def rgb(
     rendered: Float[Array, "P 3"], measured: Float[Array, "P 3"], mask: Bool[Array, " P"]
 ) -> Float[Array, ""]:
     """Mean norm of the colour difference (Eq. 12)."""
+    # The square root has no derivative at 0, which a constant image reaches
     return masked_mean(jnp.sqrt(jnp.sum((rendered - measured) ** 2, -1) + 1e-12), mask)

@@ -11,15 +11,17 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
+from mipsjax.core.compiled import compiled
+from mipsjax.core.encodings import fields
+from mipsjax.core.rigid import exp
 from mipsjax.core.views import planes_at
 
 CHUNK_SAMPLES = 12_000  # of which the activations stay in a core's cache
@@ -89,7 +91,7 @@ def create(key: PRNGKeyArray, cfg: Config) -> Learned:
     return Learned(field, optimizer(cfg).init(field))  # pyright: ignore[reportArgumentType]  (optax names no tuples, but takes any pytree)
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+@compiled("camera", "cfg")
 def refine(
     learned: Learned,
     frames: Frames,
@@ -118,6 +120,7 @@ def _in_turn_on_cpu(one: Callable[..., Any]) -> Callable[..., Any]:
 
     @either.def_vmap
     def rule(_: int, batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
+        # What `vmap` did not batch, as the number of steps, is common to all
         axes = jax.tree.map(lambda yes: 0 if yes else None, tuple(batched))
         in_turn, at_once = (jax.vmap(f, axes) for f in (jax.custom_batching.sequential_vmap(one), one))
         out = jax.lax.platform_dependent(*arguments, cpu=in_turn, default=at_once)
@@ -153,12 +156,13 @@ def descend(
     twist = jnp.zeros((frames.depth.shape[0], 6))
     start = (learned.field, learned.optimizer, twist, pose_optimizer.init(twist), jnp.zeros(()))
     field, state, twist, _, loss = jax.lax.fori_loop(0, steps, step, start)
+    # All or nothing: a submap that is half updated has networks and Adam's moments of different steps
     ok = _finite((field, twist, loss))
     learned = jax.tree.map(partial(jnp.where, ok), Learned(field, state), learned)
     return learned, jnp.where(ok, moved(frames, twist), frames.T_sub_cam), MapInfo(loss, ok)
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+@compiled("camera", "cfg")
 def refine_stack(
     learned: Learned,
     frames: Frames,
@@ -192,7 +196,8 @@ def moved(frames: Frames, twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
 
 
 def perturb(poses: Float[Array, "F 4 4"], twist: Float[Array, "F 6"]) -> Float[Array, "F 4 4"]:
-    return poses @ jax.vmap(lambda t: jaxlie.SE3.exp(t).as_matrix())(twist)
+    """Each pose after a small motion in its own frame."""
+    return poses @ jax.vmap(exp)(twist)
 
 
 def map_loss(
@@ -204,8 +209,10 @@ def map_loss(
     (`map.pose_learning_rate` 0), and is summed over chunks of rays: the losses are means over the whole draw, so their
     normalisers are counted before.
     """
+    # Drawn once for all chunks: chunks change the order of sums, not what is summed
     chunks = draw(field, frames, key, camera, cfg)
     measured = chunks.pixels.depth > 0
+    # A mean over a chunk would weigh the samples of a sparse chunk more
     totals = Totals(*(_count(mask) for mask in (chunks.samples.near, chunks.samples.free, measured)))
     loss_and_gradient = jax.value_and_grad(_share_of_loss, argnums=(0, 1))
     twist = jnp.zeros((frames.depth.shape[0], 6))
@@ -224,6 +231,7 @@ def draw(field: nf.Field, frames: Frames, key: PRNGKeyArray, camera: Intrinsics,
     pixels = jax.vmap(draw_pixels, (0, 0, 0, None, None))(
         jax.random.split(k_pixels, count), frames.depth, frames.color, camera, cfg
     )
+    # Rays of all frames in one list, each with its frame's number, so that chunks may cut anywhere
     frame = jnp.repeat(jnp.arange(count), pixels.depth.shape[1])
     pixels = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), pixels)
     depth = sampling.first_phase(k_rays, pixels.depth, cfg.field.truncation, cfg.sample)
@@ -267,16 +275,16 @@ def _share_of_loss(
         # Derivatives by poses take time, and nothing asks for them; the loss is the same
         twist = jax.lax.stop_gradient(twist)
     points = _points(moved(frames, twist), batch.frame, batch.pixels, batch.samples.depth)
-    total, finest = jnp.zeros(()), None
-    if field.smooth is not None:
+    has, total, finest = fields(cfg.field), jnp.zeros(()), None
+    if has.smooth is not None:
         finest = nf.smooth_tsdf(field, points, cfg.field)
         total += tsdf_loss(finest, batch.samples, totals, cfg)
         # Where there is a smooth field, it alone moves the poses: derivatives through the hash grid cost more
         # than the rest of the step.
         points = jax.lax.stop_gradient(points)
     encoded = nf.encode(field, points, cfg.field)
-    if field.fine is not None:
-        finest = nf.classify(field.fine, encoded, cfg.field)
+    if has.fine is not None:
+        finest = nf.decode_tsdf(field, encoded, cfg.field)
         total += tsdf_loss(finest, batch.samples, totals, cfg)
     assert finest is not None
     return total + cfg.loss.rgb * color_loss(field, finest.psi, encoded, batch, totals, cfg)
@@ -310,6 +318,7 @@ def color_loss(
     """Colour rendered on some samples of each ray, spread over the truncation region (Eqs. 4 and 12)."""
     rays, count = batch.samples.depth.shape
     some = _color_samples(count, cfg)
+    # Colour must not bend the surface: at an edge of texture it would
     psi = jax.lax.stop_gradient(psi).reshape(rays, count)[:, some]
     weights = losses.render_weights(psi, batch.samples.near[:, some], cfg.field.truncation)
     picked = encoded.reshape(rays, count, -1)[:, some]

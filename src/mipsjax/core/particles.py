@@ -6,7 +6,6 @@ the imaginary part of a unit quaternion and a translation in metres, T = T_cente
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mipsjax.config import FieldConfig
-from mipsjax.config_tracking import SearchConfig
+from mipsjax.config.sections import FieldConfig
+from mipsjax.config.tracking import SearchConfig
 from mipsjax.core import field as nf
 from mipsjax.core import losses
+from mipsjax.core.compiled import compiled
+from mipsjax.core.rigid import transform
 
 # Points per chunk of the fitness: the activations stay in cache, and starting the threads costs little.
 CHUNK_POINTS = 32768
@@ -38,6 +39,7 @@ def template(count: int, seed: int = 0) -> Float[np.ndarray, "count 6"]:
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((count, 6))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # The sixth root makes the draw even over the volume, not along the radius
     particles = direction * rng.random((count, 1)) ** (1 / 6)
     particles[0] = 0
     return particles.astype(np.float32)
@@ -47,6 +49,7 @@ def delta_pose(delta: Float[Array, "*N 6"]) -> Float[Array, "*N 4 4"]:
     """Rigid motions from imaginary quaternion parts and translations."""
     q = delta[..., :3]
     square = jnp.sum(q * q, -1, keepdims=True)
+    # A draw outside of the unit ball is no rotation: it is drawn in, to somewhat less than half a turn
     q = q * jnp.minimum(1.0, 0.99 / jnp.sqrt(jnp.maximum(square, 1e-12)))
     x, y, z = q[..., 0], q[..., 1], q[..., 2]
     w = jnp.sqrt(1 - jnp.sum(q * q, -1))
@@ -68,14 +71,14 @@ def pose_cost(
     search: SearchConfig,
 ) -> Float[Array, ""]:
     """Uncertainty-weighted depth-to-TSDF cost of one pose (Eq. 13), as a weighted mean: square metres."""
-    p_sub = p_cam @ T_sub_cam[:3, :3].T + T_sub_cam[None, :3, 3]
-    prediction = nf.tsdf(field, p_sub, cfg, "search")
+    prediction = nf.tsdf(field, transform(T_sub_cam, p_cam), cfg, "search")
     weight = mask.astype(jnp.float32)
     if search.uncertainty:
         weight = weight * losses.certainty(prediction.entropy, search.entropy_floor)
     return jnp.sum(weight * prediction.psi**2) / jnp.maximum(jnp.sum(weight), 1e-6)
 
 
+@compiled("cfg", "search")
 def fitness(
     field: nf.Field,
     poses: Float[Array, "N 4 4"],
@@ -84,10 +87,20 @@ def fitness(
     cfg: FieldConfig,
     search: SearchConfig,
 ) -> Float[Array, " N"]:
-    """Cost of every particle, by `vmap` over poses in chunks that stay in cache."""
+    """Cost of every particle, by `vmap` over poses.
+
+    On a CPU it goes by chunks whose activations stay in cache; elsewhere all are one batch, for many small ones would
+    leave a GPU idle. Which of both is chosen when the program is lowered for a device.
+    """
     chunk = max(1, CHUNK_POINTS // p_cam.shape[0])
-    one = partial(pose_cost, field, p_cam=p_cam, mask=mask, cfg=cfg, search=search)
-    return jax.lax.map(lambda T: one(T), poses, batch_size=chunk)
+
+    def one(T):
+        return pose_cost(field, T, p_cam, mask, cfg, search)
+
+    def in_chunks(poses):
+        return jax.lax.map(one, poses, batch_size=chunk)
+
+    return jax.lax.platform_dependent(poses, cpu=in_chunks, default=jax.vmap(one))
 
 
 def step(
@@ -102,15 +115,19 @@ def step(
     """One iteration: advantage set, move, rescale (Eqs. 14 to 16)."""
     deltas = particles * swarm.radii[None]
     costs = fitness(field, swarm.T_sub_cam @ delta_pose(deltas), p_cam, mask, cfg, search)
+    # A pose at which the field is not finite is never taken
     costs = jnp.nan_to_num(costs, nan=jnp.inf)
     # Particle 0 is the centre itself, on this step's pixels.
     gain = jnp.nan_to_num(jnp.maximum(costs[0] - costs, 0), posinf=0.0)
     total = jnp.sum(gain)
+    # Eq. 14: the advantage set by how much better it is than the centre
     mean = jnp.sum(gain[:, None] * deltas, 0) / jnp.maximum(total, 1e-20)
     best = deltas[jnp.argmin(costs)]
+    # The mean of good poses need not be one, as in front of two equal objects: the best one is tried, too
     ends = swarm.T_sub_cam @ delta_pose(jnp.stack([mean, best]))
     end_costs = fitness(field, ends, p_cam, mask, cfg, search)
     which = jnp.argmin(end_costs)
+    # Where nothing is better than the centre, the swarm shrinks round it
     found = total > 0
     move = jnp.where(found, jnp.where(which == 0, mean, best), 0)
     cost = jnp.where(found, end_costs[which], costs[0])

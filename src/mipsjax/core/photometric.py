@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import losses
-from mipsjax.core.camera import Intrinsics, grid_shape, project, rays, transform
+from mipsjax.core.camera import Intrinsics, grid_shape, project, unproject
 from mipsjax.core.equations import Rows, System
+from mipsjax.core.rigid import transform, transform_back
 from mipsjax.core.sampling import NEAR
 from mipsjax.core.views import JUMP
 
@@ -112,7 +113,7 @@ def _steepest(
     cells = whole.reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows * columns, high * wide)
     best, cell = jnp.argmax(cells, -1), jnp.arange(rows * columns)
     v, u = cell // columns * high + best // wide, cell % columns * wide + best % wide
-    p_cam = rays(v, u, camera.decimated(every)) * depth[v, u][:, None]
+    p_cam = unproject(v, u, depth[v, u], camera.decimated(every))
     pixel = every * jnp.stack([u, v], -1).astype(jnp.float32)
     return pixel, p_cam, jnp.max(cells, -1) > 0
 
@@ -171,6 +172,7 @@ def _rows(T: Float[Array, "4 4"], seen: Shades, camera: Intrinsics, cfg: Config)
     metres = cfg.sensor.noise_floor * jax.lax.rsqrt(compared.variance)
     error = metres * compared.error
     scale = wanted.robust * cfg.sensor.noise_floor
+    # Bounded, so that leaving the image is never a gain
     off = jnp.where(compared.mask, jnp.minimum(jnp.abs(error) / scale, LOST), LOST)
     cost = scale**2 * jnp.log1p(off**2) * (seen.measured & seen.images.mask[:, None])
     weight = compared.robust * compared.mask
@@ -183,18 +185,21 @@ def _compared(T: Float[Array, "4 4"], seen: Shades, camera: Intrinsics, cfg: Con
 
     def one(p_cam, measured, brightness, texture, image, noise):
         R_sub_ref = image.T_sub_cam[:3, :3]
-        p_ref = (transform(T, p_cam) - image.T_sub_cam[None, :3, 3]) @ R_sub_ref
+        p_ref = transform_back(image.T_sub_cam, transform(T, p_cam))
         pixel = project(p_ref, small)
         there = _between(texture, pixel)
         inside = jnp.all((pixel >= 0) & (pixel <= limit), -1) & (p_ref[:, 2] > NEAR)
         steep = jnp.sum(there[:, 1:] ** 2, -1) > STEEP**2
+        # Steep where the image shows it, too: on an even patch any pose is as good
         shown = inside & steep & _shown(image.depth, p_ref, camera) & measured & image.mask
         # By the point in the image's camera, then in its own
         z = jnp.maximum(p_ref[:, 2], NEAR)
         by_u, by_v = there[:, 1] * small.fx / z, there[:, 2] * small.fy / z
+        # Derivatives of the pinhole projection: u moves by fx / z along x, and by -fx x / z^2 along z
         by_ref = jnp.stack([by_u, by_v, -(by_u * p_ref[:, 0] + by_v * p_ref[:, 1]) / z], -1)
         by_cam = by_ref @ R_sub_ref.T @ T[:3, :3]
         jacobian = jnp.concatenate([by_cam, jnp.cross(p_cam, by_cam)], -1)
+        # A point whose depth is wrong is looked for beside its place, and is as much brighter there
         by_depth = cfg.sensor.noise_floor * jnp.sum(by_cam * p_cam, -1) / jnp.maximum(p_cam[:, 2], NEAR)
         variance = noise**2 + by_depth**2 / losses.precision(p_cam[:, 2], cfg.sensor)
         return _evened(there[:, 0], brightness, jacobian, variance, shown, cfg)
@@ -209,6 +214,7 @@ def _evened(there, here, jacobian, variance, shown, cfg: Config) -> _Compared:
 
     def without_light(values):
         """Less what gain and offset explain of them; a weak prior keeps both where there is little to tell them by."""
+        # By the noise, without which one bright spot would set the gain of the image
         weight = robust * shown / variance
         total = jnp.sum(weight) + 1
         centred, offset = here - weight @ here / total, weight @ values / total
@@ -236,6 +242,7 @@ def _texture(grey: Float[Array, "H W"], level: int) -> Float[Array, "h w 3"]:
     """Brightness, 0 to 1, slightly smoothed, and its central differences along u and v."""
     size = 2**level
     height, width = grey.shape[0] // size, grey.shape[1] // size
+    # Means of whole tiles; rows and columns that make none are left out, as in the camera of `_halved`
     tiles = grey[: height * size, : width * size].reshape(height, size, width, size)
     image = jnp.mean(tiles, (1, 3)) / 255
 
@@ -262,6 +269,7 @@ def _halved(camera: Intrinsics, size: int) -> Intrinsics:
 def _between(texture: Float[Array, "h w C"], pixel: Float[Array, "P 2"]) -> Float[Array, "P C"]:
     """Values between four pixels each; those outside mean nothing."""
     height, width = texture.shape[:2]
+    # The last pixel has no right neighbour: it is read as the end of the cell before
     corner = jnp.clip(jnp.floor(pixel), 0, jnp.array([[width - 2, height - 2]])).astype(jnp.int32)
     share = jnp.clip(pixel - corner, 0, 1)
     place, values = corner[:, 1] * width + corner[:, 0], texture.reshape(-1, texture.shape[-1])

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import losses
-from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays
+from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, unproject
+from mipsjax.core.compiled import compiled
 from mipsjax.core.equations import Points, Prior, descend, mean_precision, prior_system
 from mipsjax.core.photometric import Images, pyramid, with_noise
 from mipsjax.core.solvers import (
@@ -74,7 +75,7 @@ class Relative(NamedTuple):
     """Share of the second frame's points that lie on surfaces of the first."""
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+@compiled("camera", "cfg")
 def measure(pairs: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Config) -> Relative:
     """Robust second-order steps on point-to-plane distances, errors of corners in the image and differences of
     brightness, one pair after the other.
@@ -119,6 +120,7 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
     rows = view_rows(T, points, views, camera, cfg)
     held = of_points * steady_hessian([rows], points, normals) + prior.weight
     hit = view_errors(T, points, views, camera, cfg).mask[0].astype(jnp.float32)
+    # In units: the inverse variance of a depth measured close by
     close_by = 1 / cfg.sensor.noise_floor**2
     return Relative(
         T,
@@ -133,8 +135,9 @@ def _measured(pair: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Con
 def _points(depth: Float[Array, "h w"], camera: Intrinsics, cfg: Config) -> Points:
     """Of a stripe grid of about `pairs.pixels` cells, none of them shifted: the same in each call."""
     small = camera.decimated(round(camera.width / depth.shape[1]))
+    # The middle of each cell: a draw would make the result depend on a key
     middle = jnp.full(2, 0.5)
     v, u = pixel_grid(*grid_shape(cfg.pairs.pixels, *depth.shape), middle, *depth.shape)
     d = depth[v, u]
-    p_cam = rays(v, u, small) * d[:, None]
+    p_cam = unproject(v, u, d, small)
     return Points(p_cam, jnp.zeros_like(p_cam), d > 0)

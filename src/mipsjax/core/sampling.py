@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from mipsjax.config import SampleConfig
+from mipsjax.config.sections import SampleConfig
 
 NEAR = 0.05  # metres; free space is sampled from here, just in front of the lens
 
@@ -64,6 +64,7 @@ def second_phase(
     """
     if cfg.surface == 0:
         return depth
+    # Nearest to the zero crossing among the samples that there are; more of them go there
     best = jnp.argmin(jnp.abs(distance(depth)), -1)
     center = jnp.take_along_axis(depth, best[:, None], -1)[:, 0]
     lo = jnp.maximum(center - cfg.surface_spread, NEAR)
@@ -81,6 +82,7 @@ def label(
     truncation region, where nothing is known.
     """
     difference = measured[:, None] - depth
+    # Without a measurement the difference means nothing: neither mask may hold
     valid = (measured > 0)[:, None]
     target = difference * slope[:, None]
     near = valid & (jnp.abs(difference) <= truncation)

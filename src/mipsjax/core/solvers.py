@@ -11,14 +11,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, sampling
-from mipsjax.core.camera import Intrinsics, transform
+from mipsjax.core.camera import Intrinsics
 from mipsjax.core.equations import (
     Points,
     Prior,
@@ -31,6 +30,7 @@ from mipsjax.core.equations import (
     robust_cost,
 )
 from mipsjax.core.photometric import Shades, brightness_system
+from mipsjax.core.rigid import perturbed, transform, transform_back
 from mipsjax.core.views import PlaneErrors, Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
@@ -199,7 +199,9 @@ def steady_hessian(parts: list[Rows], points: Points, normals: Float[Array, "P 3
     own = by_twist(points.p_cam, normals)
     # A point's own noise is the same against each surface
     each = [(part.weight[..., None] * part.jacobian).reshape(-1, *own.shape) for part in parts]
+    # Over all surfaces that a point was measured against
     weighted = jnp.sum(jnp.concatenate(each), 0)
+    # Noise of the two factors is independent, so that the mean of their product is that without noise
     agreed = weighted.T @ own
     # Not those of the Hessian: by noise they lean towards what is held, which is a hundred times as firm
     strength, directions = jnp.linalg.eigh((agreed + agreed.T) / 2)
@@ -255,9 +257,10 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
     """
     corners = cfg.track.corners
     metres = cfg.sensor.noise_floor * camera.fx / corners.noise_px
-    p_cam = (landmarks.p_sub - T[None, :3, 3]) @ T[:3, :3]
+    p_cam = transform_back(T, landmarks.p_sub)
     in_front = p_cam[:, 2] > sampling.NEAR
     z = jnp.where(in_front, p_cam[:, 2], 1.0)
+    # At focal length 1: errors of all corners have one unit, which `metres` turns into that of depth
     aim = p_cam[:, :2] / z[:, None]
     error = metres * jnp.einsum("nij,nj->ni", landmarks.axes, aim - landmarks.ray)
     # T exp(xi) moves a point of the submap by -v - omega x p in the camera's frame
@@ -291,7 +294,7 @@ def adam(
     optimizer = optax.adam(cfg.track.go.learning_rate)
 
     def loss(twist):
-        T_new = T @ jaxlie.SE3.exp(twist).as_matrix()
+        T_new = perturbed(T, twist)
         psi = nf.tsdf(field, transform(T_new, points.p_cam), cfg.field).psi
         total = losses.d2t(psi, points.mask)
         return (
@@ -307,12 +310,13 @@ def adam(
 
     zero = jnp.zeros(6)
     (twist, _), _ = jax.lax.scan(step, (zero, optimizer.init(zero)), None, length=cfg.track.go.steps)
-    return T @ jaxlie.SE3.exp(twist).as_matrix()
+    return perturbed(T, twist)
 
 
 def _rgb_loss(field, T, points: Points, key, cfg: Config) -> Float[Array, ""]:
     tau = cfg.field.truncation
     measured = points.p_cam[:, 2]
+    # Only about the surface: free space has no colour to render
     depth = sampling.stratified(
         key, jnp.maximum(measured - tau, sampling.NEAR), measured + tau, cfg.sample.truncation
     )

@@ -6,6 +6,7 @@ T(xi) = T exp(xi).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -13,12 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
 
-from mipsjax.config import Config
+from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core import losses, particles
-from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, transform
+from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, rays, unproject
+from mipsjax.core.compiled import compiled
+from mipsjax.core.encodings import fields
 from mipsjax.core.equations import Points, Prior, robust_cost
-from mipsjax.core.photometric import LEVELS, Images, grey_of, pyramid, with_noise
+from mipsjax.core.photometric import LEVELS, Images, Shades, grey_of, pyramid, with_noise
+from mipsjax.core.rigid import transform
 from mipsjax.core.solvers import (
     Evidence,
     Information,
@@ -72,7 +76,7 @@ def draw_points(
     height, width = depth.shape
     v, u = pixel_grid(*grid_shape(pixels, height, width), jax.random.uniform(key, (2,)), height, width)
     d = depth[v, u]
-    return Points(rays(v, u, camera) * d[:, None], color[v, u].astype(jnp.float32) / 255, d > 0)
+    return Points(unproject(v, u, d, camera), color[v, u].astype(jnp.float32) / 255, d > 0)
 
 
 def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: nf.Part, cfg: Config) -> Fit:
@@ -87,7 +91,7 @@ def measure_fit(field: nf.Field, T: Float[Array, "4 4"], points: Points, part: n
     return Fit(jnp.sqrt(cost), known, confirmed)
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+@compiled("camera", "cfg")
 def track(
     field: nf.Field,
     depth: Float[Array, "H W"],
@@ -128,81 +132,184 @@ def track(
     before = measure_fit(field, start, points, "whole", cfg)
     # So weak that it counts only where nothing else holds the frame
     prior = Prior(start, (cfg.sensor.noise_floor / cfg.track.prior) ** 2 * jnp.eye(6))
-
-    def compared(levels):
-        """With earlier frames, the finest level first."""
-        return [] if images is None else pyramid(images, grey_of(color), depth, levels, camera, cfg)
-
-    def closer(T):
-        """By images and depth images of earlier frames alone, from coarse to fine."""
-        for level in reversed(compared(LEVELS)[1:]):
-            seen = Evidence(coarse, views, landmarks, level, trust, prior)
-            T = approach(T, seen, cfg.track.brightness.coarse_steps, camera, cfg)
-        return T
-
-    finest = next(iter(compared(1)), None)
-    few = jnp.bool_(False) if images is None else jnp.any(images.mask)  # without colour the map comes first
-    if landmarks is not None:
-        few &= jnp.sum(landmarks.mask) < ENOUGH
-
-    def evidence(T):
-        """Of the frame about at T."""
-        trusted, shade = points, finest and with_noise(finest, T, camera, cfg)
-        if known is not None:
-            small = camera.decimated(round(camera.width / known.depth.shape[2]))
-            learned = observed(known, transform(T, points.p_cam), small, BEHIND)
-            trusted = points._replace(mask=points.mask & learned)
-        return Evidence(trusted, views, landmarks, shade, trust, prior)
-
+    frame = _Frame(
+        field=field,
+        depth=depth,
+        color=color,
+        points=points,
+        coarse=coarse,
+        views=views,
+        landmarks=landmarks,
+        known=known,
+        images=images,
+        finest=None,
+        trust=trust,
+        prior=prior,
+        widening=widening,
+        k_ro=k_ro,
+        k_adam=k_adam,
+        camera=camera,
+        cfg=cfg,
+    )
+    if images is not None:
+        frame = frame._replace(finest=frame.compared(1)[0])
     limit = ro.residual if converged is None else converged
-    smooth = go.method == "lm" and cfg.field.encoding == "both"
 
-    def near(T):
-        if go.method == "adam":
-            T = adam(field, T, points, k_adam, cfg)
-        elif go.method == "lm":
-            T = levenberg_marquardt(field, T, evidence(T), "whole", go.steps, camera, cfg)
-        return T, measure_fit(field, T, points, "whole", cfg)
+    first, *others = _attempts(cfg)
+    found, searched = first(frame, start), jnp.bool_(first is _by_search)
+    for attempt in others:
+        found, tried = _unless_converged(found, attempt, frame, start, limit)
+        if attempt is _by_search:
+            searched = tried
 
-    def far(T):
-        if smooth:
-            T = levenberg_marquardt(field, T, Evidence(coarse), "search", go.smooth_steps, camera, cfg)
-        return near(T)
-
-    def searched(T):
-        return far(search(field, depth, color, T, widening, k_ro, camera, cfg))
-
-    def tried(attempt, found):
-        """The better of what was found and of another attempt, where the first has not converged; and whether."""
-        fit = found[1]
-        failed = (fit.residual > limit) | (fit.known < ro.inliers) | ~jnp.isfinite(fit.residual)
-
-        def again():
-            there = attempt(start)
-            better = (there[1].residual < fit.residual) | ~jnp.isfinite(fit.residual)
-            return jax.tree.map(partial(jnp.where, better), there, found)
-
-        return jax.lax.cond(failed, again, lambda: found), failed
-
-    used_ro = jnp.bool_(ro.when == "always")
-    if ro.when == "always":
-        T, after = searched(start)
-    else:
-        # Where that leads astray, the attempts that follow begin anew
-        found = near(start if images is None else jax.lax.cond(few, closer, lambda T: T, start))
-        if smooth:
-            found, _ = tried(far, found)
-        if ro.when == "needed":
-            found, used_ro = tried(searched, found)
-        T, after = found
+    T, after = found
     ok = jnp.all(jnp.isfinite(T)) & jnp.isfinite(after.residual)
     T = jnp.where(ok, T, start)
     normals = own_normals(depth, points.p_cam, camera, cfg.sensor.noise_growth)
-    holds = information(field, T, evidence(T), normals, camera, cfg)
-    return T, TrackInfo(before, after, holds, used_ro, ok)
+    holds = information(field, T, frame.evidence(T), normals, camera, cfg)
+    return T, TrackInfo(before, after, holds, searched, ok)
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+class _Found(NamedTuple):
+    """Where an attempt at a frame ended."""
+
+    T_sub_cam: Float[Array, "4 4"]
+    fit: Fit
+
+
+class _Frame(NamedTuple):
+    """A frame that is to be tracked, and all that attempts at it use; the arguments of `track` say more.
+
+    It lives while `track` is traced and is no argument of compiled code: `camera` and `cfg` are no arrays.
+    """
+
+    field: nf.Field
+    depth: Float[Array, "H W"]
+    color: UInt8[Array, "H W 3"]
+    points: Points
+    """For the steps on the most accurate field."""
+    coarse: Points
+    """Fewer, for those on the smooth field and by images alone."""
+    views: Views | None
+    landmarks: Landmarks | None
+    known: Views | None
+    images: Images | None
+    finest: Shades | None
+    """The frame's brightness against `images`, at their full size."""
+    trust: Float[Array, ""] | float
+    prior: Prior
+    widening: Float[Array, ""]
+    k_ro: PRNGKeyArray
+    k_adam: PRNGKeyArray
+    camera: Intrinsics
+    cfg: Config
+
+    def compared(self, levels: int) -> list[Shades]:
+        """With earlier frames, the finest level first."""
+        assert self.images is not None
+        return pyramid(self.images, grey_of(self.color), self.depth, levels, self.camera, self.cfg)
+
+    def evidence(self, T: Float[Array, "4 4"]) -> Evidence:
+        """What says where the frame is, about at T."""
+        trusted, shades = self.points, self.finest
+        if shades is not None:
+            shades = with_noise(shades, T, self.camera, self.cfg)
+        if self.known is not None:
+            small = self.camera.decimated(round(self.camera.width / self.known.depth.shape[2]))
+            learned = observed(self.known, transform(T, trusted.p_cam), small, BEHIND)
+            trusted = trusted._replace(mask=trusted.mask & learned)
+        return Evidence(trusted, self.views, self.landmarks, shades, self.trust, self.prior)
+
+
+_Attempt = Callable[[_Frame, Float[Array, "4 4"]], _Found]
+
+
+def _attempts(cfg: Config) -> list[_Attempt]:
+    """The ways to a pose, in their order: each is tried where those before it have not converged."""
+    if cfg.track.ro.when == "always":
+        return [_by_search]
+    ways: list[_Attempt] = [_by_images]
+    if _smooth_first(cfg):
+        ways.append(_by_smooth)
+    if cfg.track.ro.when == "needed":
+        ways.append(_by_search)
+    return ways
+
+
+def _smooth_first(cfg: Config) -> bool:
+    """Whether there is a smooth field beside the accurate one, on which second-order steps come from farther off."""
+    return cfg.track.go.method == "lm" and fields(cfg.field).two
+
+
+def _unless_converged(
+    found: _Found,
+    attempt: _Attempt,
+    frame: _Frame,
+    start: Float[Array, "4 4"],
+    limit: Float[Array, ""] | float,
+) -> tuple[_Found, Bool[Array, ""]]:
+    """The better of what was found and of another attempt, where the first has not converged; and whether it was made.
+
+    It begins anew, at `start`: where the attempts before it led astray, their end is no place to begin from.
+    """
+    fit = found.fit
+    failed = (fit.residual > limit) | (fit.known < frame.cfg.track.ro.inliers) | ~jnp.isfinite(fit.residual)
+
+    def again() -> _Found:
+        there = attempt(frame, start)
+        better = (there.fit.residual < fit.residual) | ~jnp.isfinite(fit.residual)
+        return jax.tree.map(partial(jnp.where, better), there, found)
+
+    return jax.lax.cond(failed, again, lambda: found), failed
+
+
+def _refined(frame: _Frame, T: Float[Array, "4 4"]) -> _Found:
+    """GO on the most accurate field: where every attempt ends."""
+    go = frame.cfg.track.go
+    if go.method == "adam":
+        T = adam(frame.field, T, frame.points, frame.k_adam, frame.cfg)
+    elif go.method == "lm":
+        T = levenberg_marquardt(frame.field, T, frame.evidence(T), "whole", go.steps, frame.camera, frame.cfg)
+    return _Found(T, measure_fit(frame.field, T, frame.points, "whole", frame.cfg))
+
+
+def _by_images(frame: _Frame, T: Float[Array, "4 4"]) -> _Found:
+    """First by images and depth images of earlier frames alone, from coarse to fine, where there are few landmarks."""
+    if frame.images is None:
+        return _refined(frame, T)
+    few = jnp.any(frame.images.mask)  # without colour the map comes first
+    if frame.landmarks is not None:
+        few &= jnp.sum(frame.landmarks.mask) < ENOUGH
+
+    def closer(T):
+        # The finest level is left to the steps on the map, which have it, too
+        for level in reversed(frame.compared(LEVELS)[1:]):
+            seen = Evidence(frame.coarse, frame.views, frame.landmarks, level, frame.trust, frame.prior)
+            steps = frame.cfg.track.brightness.coarse_steps
+            T = approach(T, seen, steps, frame.camera, frame.cfg)
+        return T
+
+    return _refined(frame, jax.lax.cond(few, closer, lambda T: T, T))
+
+
+def _by_smooth(frame: _Frame, T: Float[Array, "4 4"]) -> _Found:
+    """First on the smooth field, if there is one beside the other, and by the frame's depth alone."""
+    if _smooth_first(frame.cfg):
+        steps = frame.cfg.track.go.smooth_steps
+        seen = Evidence(frame.coarse)
+        T = levenberg_marquardt(frame.field, T, seen, "search", steps, frame.camera, frame.cfg)
+    return _refined(frame, T)
+
+
+def _by_search(frame: _Frame, T: Float[Array, "4 4"]) -> _Found:
+    """First RO, then the smooth field."""
+    there = search(
+        frame.field, frame.depth, frame.color, T, frame.widening, frame.k_ro, frame.camera, frame.cfg
+    )
+    return _by_smooth(frame, there)
+
+
+@compiled("camera", "cfg")
 def align(
     field: nf.Field,
     depth: Float[Array, "F H W"],
@@ -216,6 +323,7 @@ def align(
     `colour` is how firmly images held each of them where it is (corners and brightness of `Information`): what surfaces
     leave free stays as it was. So does a frame that does not come out finite.
     """
+    # Every pixel: the images are small, and what is not drawn needs no key
     v, u = jnp.mgrid[: camera.height, : camera.width].reshape(2, -1)
     ray = rays(v, u, camera)
 
@@ -243,7 +351,7 @@ class Registration(NamedTuple):
     a bare corridor, and the guess says where it is."""
 
 
-@partial(jax.jit, static_argnames=("camera", "cfg"))
+@compiled("camera", "cfg")
 def register(
     field: nf.Field,
     depth: Float[Array, "H W"],
@@ -258,6 +366,7 @@ def register(
     Only pixels that they observed count, at the guess: elsewhere the submap is certain of surfaces that it made up, as
     behind a shelf, and a frame that sees past the shelf would be drawn along it.
     """
+    # No term reads it here; the points only need one
     color = jnp.zeros((*depth.shape, 3), jnp.uint8)
     every = draw_points(jax.random.key(0), depth, color, cfg.track.go.pixels, camera)
 
@@ -265,9 +374,10 @@ def register(
         return every.mask & observed(views, transform(T, every.p_cam), camera, BEHIND)
 
     points = every._replace(mask=known(T))
-    if cfg.field.encoding == "both":
+    if fields(cfg.field).two:
         T = levenberg_marquardt(field, T, Evidence(points), "search", cfg.track.go.smooth_steps, camera, cfg)
     T = levenberg_marquardt(field, T, Evidence(points, views), "whole", cfg.track.go.steps, camera, cfg)
+    # By the map alone, on which overlap and inliers are judged as well
     hessian = map_rows(field, T, points, "whole", cfg).system().hessian
     held = jnp.linalg.eigvalsh(hessian)[0] / jnp.maximum(jnp.sum(points.mask), 1)
     prediction = nf.tsdf(field, transform(T, every.p_cam), cfg.field)
@@ -295,6 +405,8 @@ def search(
         points = draw_points(k, depth, color, ro.pixels, camera)
         return particles.step(swarm, swarm_template, field, points.p_cam, points.mask, cfg.field, ro), None
 
+    # Rotation first, as the quaternion part comes first in a particle
     radii = widening * jnp.array([ro.rotation] * 3 + [ro.translation] * 3)
+    # Its cost is not asked for before the first step, which evaluates the centre on its own pixels
     swarm = particles.Swarm(T, jnp.float32(jnp.inf), radii)
     return jax.lax.scan(step, swarm, jax.random.split(key, ro.steps))[0].T_sub_cam

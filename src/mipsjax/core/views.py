@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mipsjax.core.camera import Intrinsics, project, rays
+from mipsjax.core.camera import Intrinsics, project, unproject
+from mipsjax.core.rigid import transform_back
 
 STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
 STEADY = 64  # so many such steps make the image's width, where it matters more that a normal has little noise
@@ -76,6 +77,7 @@ def observed(
     def one(depth, T_sub_cam):
         pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
         d = depth[pixel.v, pixel.u]
+        # In front of what was seen is free space, which was observed as well
         return pixel.inside & (d > 0) & (pixel.p_cam[:, 2] < d + margin)
 
     return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
@@ -109,8 +111,9 @@ def _pixels(
     p_sub: Float[Array, "P 3"], T_sub_cam: Float[Array, "4 4"], size: tuple[int, int], camera: Intrinsics
 ) -> _Pixels:
     height, width = size
-    p_cam = (p_sub - T_sub_cam[None, :3, 3]) @ T_sub_cam[:3, :3]
+    p_cam = transform_back(T_sub_cam, p_sub)
     u, v = jnp.round(project(p_cam, camera)).T
+    # Before clipping: a pixel outside of the image is no pixel on its border
     inside = (p_cam[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     v, u = jnp.clip(v, 0, height - 1).astype(jnp.int32), jnp.clip(u, 0, width - 1).astype(jnp.int32)
     return _Pixels(p_cam, v, u, inside)
@@ -130,16 +133,19 @@ def planes_at(
 
     def point(dv, du):
         vv, uu = jnp.clip(v + dv, 0, height - 1), jnp.clip(u + du, 0, width - 1)
-        return rays(vv, uu, camera) * depth[vv, uu][:, None]
+        return unproject(vv, uu, depth[vv, uu], camera)
 
     here = point(0, 0)
     right, left, down, up = point(0, step), point(0, -step), point(step, 0), point(-step, 0)
+    # In this order it points towards the camera: x is right, y down, z forward
     normal = jnp.cross(down - up, right - left)
     squared = jnp.sum(normal**2, -1)
+    # Beside missing depth the differences may be parallel, or nothing
     exists = squared > 1e-18
     normal = normal * jax.lax.rsqrt(jnp.where(exists, squared, 1.0))[:, None]
     jumps = [jnp.abs(p[:, 2] - here[:, 2]) < JUMP * here[:, 2] for p in (right, left, down, up)]
     smooth = jnp.stack(jumps).all(0) & exists
     off = [jnp.abs(jnp.sum(((a + b) / 2 - here) * normal, -1)) for a, b in ((right, left), (down, up))]
+    # Noise of depth grows with its square (structured light and stereo)
     even = BEND + NOISE * noise_growth * here[:, 2] ** 2
     return Planes(here, normal, smooth, smooth & (jnp.maximum(*off) < even))

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from mipsjax.config_submaps import VolumeConfig
-from mipsjax.core.camera import Intrinsics
+from mipsjax.config.submaps import VolumeConfig
+from mipsjax.core.camera import Intrinsics, rays
 
 ROWS, COLUMNS = 12, 16
 """Pixels of an image whose rays stand for it: a step of about 4 degrees for a common depth camera."""
@@ -58,14 +58,9 @@ def seen(depth: Float[np.ndarray, "h w"], camera: Intrinsics, cfg: VolumeConfig)
         reach = np.minimum(measured, cfg.far)
     else:
         reach, valid, even = measured, valid & (measured < cfg.far), np.ones(1)
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], -1)
-    p_cam = ray[:, None] * (reach[:, None] * even)[..., None]
+    depths = reach[:, None] * even
+    p_cam = rays(v, u, camera)[:, None] * depths[..., None]
     return Seen(p_cam.reshape(-1, 3), np.repeat(valid, len(even)))
-
-
-def moved(T_a_b: Float64[np.ndarray, "4 4"], p_b: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
-    """Points from frame b to frame a, in double precision."""
-    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def grow(
@@ -85,9 +80,11 @@ def grow(
     if box is None:
         nearest = np.clip(np.zeros(3), *needed)
         box = Box(nearest, nearest)
+    # How far each face would have to move outwards
     below, above = np.maximum(box.lo - needed.lo, 0), np.maximum(needed.hi - box.hi, 0)
     wanted, free = below + above, np.maximum(cfg.max_side - (box.hi - box.lo), 0)
     fits = wanted <= free
+    # Both ends of a side that would become too long get the same share of what they want
     share = free / np.where(fits, 1, wanted)
     # Where all of it fits, the bounds are taken over exactly: the points on them are inside, not just outside
     lo = np.where(fits, np.minimum(box.lo, needed.lo), box.lo - share * below)

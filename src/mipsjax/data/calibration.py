@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.textfile import read_number_block, read_text
 from mipsjax.errors import ConfigError, InputError
@@ -21,6 +21,18 @@ DEFAULT_FPS = 30.0
 
 ASPECT_TOLERANCE = 0.01
 """How far sizes of one view may differ in aspect: ScanNet's 1296 x 968 and 640 x 480 do by 0.004."""
+
+LARGEST_SIDE = 1 << 14
+"""Pixels along a side of an image; more than any depth camera has, and what says so is damaged or something else."""
+
+FOCAL_RATIOS = (0.1, 30.0)
+"""Focal length over the width of the image: a view of 157 degrees and one of 2 degrees. No depth camera is beyond."""
+
+DEPTH_UNITS = (1e-3, 1e9)
+"""Depth units per metre, from kilometres to nanometres."""
+
+FRAME_RATES = (1e-3, 1e5)
+"""Frames a second."""
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -83,7 +95,11 @@ def declared_intrinsics(numbers: Sequence[float | int]) -> Calibration:
     Raises ConfigError for any other count.
     """
     if len(numbers) not in (4, 6):
-        raise ConfigError(f"--intrinsics takes FX FY CX CY [W H], got {len(numbers)} numbers")
+        raise ConfigError(f"--intrinsics takes FX FY CX CY [W H], 4 or 6 of them, got {len(numbers)} numbers")
+    if not all(_is_finite(number) for number in numbers):
+        raise ConfigError("--intrinsics takes FX FY CX CY [W H] in pixels: one of them is not finite")
+    if not all(0 < side <= LARGEST_SIDE for side in numbers[4:]):
+        raise ConfigError(f"--intrinsics: W and H must be from 1 to {LARGEST_SIDE}, the size of an image")
     size = (int(numbers[4]), int(numbers[5])) if len(numbers) == 6 else "depth"
     fx, fy, cx, cy = (float(number) for number in numbers[:4])
     return Calibration(fx, fy, cx, cy, size, "--intrinsics", declared=True)
@@ -122,10 +138,10 @@ def read_camera_json(path: Path) -> CameraFile:
     fx, fy, cx, cy = (json_number(content, name, path) for name in ("fx", "fy", "cx", "cy"))
     size = "depth"
     if "width" in content or "height" in content:
-        size = (int(json_number(content, "width", path)), int(json_number(content, "height", path)))
+        size = (json_side(content, "width", path), json_side(content, "height", path))
     calibration = Calibration(fx, fy, cx, cy, size, path.name)
     depth_scale = json_depth_scale(content, "depth_scale", path) if "depth_scale" in content else None
-    fps = json_positive(content, "fps", path) if "fps" in content else None
+    fps = json_within(content, "fps", FRAME_RATES, path) if "fps" in content else None
     return CameraFile(calibration, depth_scale, fps)
 
 
@@ -148,17 +164,24 @@ def json_number(content: dict[str, Any], name: str, path: Path) -> float:
     return float(value)
 
 
-def json_positive(content: dict[str, Any], name: str, path: Path) -> float:
-    """One finite number above zero. Raises InputError naming file and value."""
+def json_within(content: dict[str, Any], name: str, bounds: tuple[float, float], path: Path) -> float:
+    """One positive number within bounds. Raises InputError naming file and value."""
     value = json_number(content, name, path)
     if not value > 0:
         raise InputError(f"{path}: {name} must be positive, got {value:g}")
+    if not bounds[0] <= value <= bounds[1]:
+        raise InputError(f"{path}: {name} must be between {bounds[0]:g} and {bounds[1]:g}, got {value:g}")
     return value
+
+
+def json_side(content: dict[str, Any], name: str, path: Path) -> int:
+    """Width or height of an image in pixels. Raises InputError naming file and value."""
+    return int(json_within(content, name, (1, LARGEST_SIDE), path))
 
 
 def json_depth_scale(content: dict[str, Any], name: str, path: Path) -> DepthScale:
     """Depth units per metre. Raises InputError naming file and value."""
-    return DepthScale(json_positive(content, name, path), path.name)
+    return DepthScale(json_within(content, name, DEPTH_UNITS, path), path.name)
 
 
 def read_matrix_intrinsics(path: Path, rows: int, size: Size | Literal["color", "depth"]) -> Calibration:
@@ -204,6 +227,11 @@ def check_intrinsics(intrinsics: Intrinsics, given: Calibration) -> list[str]:
         raise InputError(f"unusable intrinsics: {values}")
     if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         raise InputError(f"the principal point is outside the image: {values}; the order is FX FY CX CY")
+    ratios = abs(fx) / width, abs(fy) / height
+    if not all(FOCAL_RATIOS[0] <= ratio <= FOCAL_RATIOS[1] for ratio in ratios):
+        raise InputError(
+            f"no camera has such a focal length: {values}; pass --intrinsics FX FY CX CY in pixels"
+        )
     if fx > 0 and fy > 0:
         return []
     if not given.declared:

@@ -14,13 +14,14 @@ from jaxtyping import UInt8, UInt16
 
 from mipsjax.data.calibration import (
     CAMERA_FILE,
+    LARGEST_SIDE,
     MILLIMETRES,
     Calibration,
     Options,
     frame_rate,
     with_camera_file,
 )
-from mipsjax.data.images import DEPTH_BITS, ImageHeader
+from mipsjax.data.images import DEPTH_BITS, MOST_PIXELS, ImageHeader
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
 from mipsjax.data.scannet import find_root, has_png_color, read_frames
 from mipsjax.errors import InputError
@@ -33,42 +34,68 @@ SYNTHETIC = Calibration(320.0, 320.0, 319.5, 239.5, (640, 480), "FastCaMo-Synth"
 _SUFFIX = ".seq"
 _HEADER = np.dtype("<i4")
 _HEADER_FIELDS = 3
-_LARGEST_SIDE = 1 << 14
-"""A larger image side means that the file is something else."""
+_OFFSET = _HEADER.itemsize * _HEADER_FIELDS
+_DEPTH, _COLOR = np.dtype("<u2"), np.dtype(("u1", 3))
+"""Of one pixel, in this order in the file."""
 
 
 @dataclass(frozen=True)
 class SeqFile:
-    """Frames of a `.seq` file, read from the mapped file when asked for."""
+    """Frames of a `.seq` file, read when asked for. Not mapped into memory: where a mapped file is cut meanwhile, the
+    system ends the process."""
 
     path: Path
-    frames: np.memmap
-    """Records with `depth` and `color`, one a frame."""
+    frames: int
+    height: int
+    width: int
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return self.frames
 
     def color(self, position: int) -> tuple[UInt8[np.ndarray, "H W 3"] | None, str]:
         """RGB pixels."""
-        return np.ascontiguousarray(self.frames[position]["color"][..., ::-1]), ""
+        bgr, problem = self._pixels(position, _COLOR, "color")
+        return (None, problem) if bgr is None else (np.ascontiguousarray(bgr[..., ::-1]), "")
 
     def raw_depth(self, position: int) -> tuple[UInt16[np.ndarray, "H W"] | None, str]:
         """Depth in millimetres."""
-        return np.array(self.frames[position]["depth"], dtype=np.uint16), ""
+        depth, problem = self._pixels(position, _DEPTH, "depth")
+        return (None, problem) if depth is None else (depth.astype(np.uint16), "")
 
     def color_header(self, position: int) -> ImageHeader | None:
         """Size and type."""
-        height, width = self.frames.dtype["depth"].shape
-        return ImageHeader(width, height, 8, 3)
+        return ImageHeader(self.width, self.height, 8, 3)
 
     def depth_header(self, position: int) -> ImageHeader | None:
         """Size and type."""
-        height, width = self.frames.dtype["depth"].shape
-        return ImageHeader(width, height, DEPTH_BITS, 1)
+        return ImageHeader(self.width, self.height, DEPTH_BITS, 1)
 
     def depth_name(self, position: int) -> Path:
         """The file, for messages."""
         return self.path
+
+    def files(self, position: int) -> tuple[Path, ...]:
+        """The one of all frames."""
+        return (self.path,)
+
+    def _pixels(self, position: int, kind: np.dtype, name: str) -> tuple[np.ndarray | None, str]:
+        """One of the two images of a frame, or None and why not."""
+        record = _record(self.height, self.width)
+        offset = 0 if name == "depth" else self.height * self.width * _DEPTH.itemsize
+        shape = (self.height, self.width, *kind.shape)
+        try:
+            with self.path.open("rb") as file:
+                file.seek(_OFFSET + position * record.itemsize + offset)
+                data = file.read(self.height * self.width * kind.itemsize)
+        except OSError as error:
+            return None, f"unreadable_{name}: {self.path.name}: {error.strerror or error}"
+        if len(data) < self.height * self.width * kind.itemsize:
+            return None, f"unreadable_{name}: {self.path.name}: cut short"
+        return np.frombuffer(data, kind.base).reshape(shape), ""
+
+
+def _record(height: int, width: int) -> np.dtype:
+    return np.dtype([("depth", _DEPTH, (height, width)), ("color", _COLOR, (height, width))])
 
 
 def matches(path: Path) -> bool:
@@ -91,22 +118,22 @@ def read(path: Path, options: Options) -> ImageSequence:
 
 
 def open_seq(path: Path) -> tuple[SeqFile, tuple[str, ...]]:
-    """Maps a `.seq` file, and remarks if it is cut short. Raises InputError if it is no such file."""
+    """Frames of a `.seq` file, and remarks if it is cut short. Raises InputError if it is no such file."""
     try:
         header = np.fromfile(path, _HEADER, _HEADER_FIELDS)
         size = path.stat().st_size
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     count, height, width = (int(value) for value in header) if len(header) == _HEADER_FIELDS else (0, 0, 0)
-    if count <= 0 or not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
+    if count <= 0 or not (0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE):
         raise InputError(f"{path}: not a .seq file (frames {count}, height {height}, width {width})")
-    record = np.dtype([("depth", "<u2", (height, width)), ("color", "u1", (height, width, 3))])
-    offset = _HEADER.itemsize * _HEADER_FIELDS
-    whole = min(count, (size - offset) // record.itemsize)
+    if height * width > MOST_PIXELS:
+        raise InputError(f"{path}: images of {width} x {height} pixels, at most {MOST_PIXELS} are read")
+    whole = min(count, (size - _OFFSET) // _record(height, width).itemsize)
     if whole < 1:
         raise InputError(f"{path}: {count} frames announced, not one is complete")
     notes = (f"{path.name}: {count} frames announced, {whole} are complete",) if whole < count else ()
-    return SeqFile(path, np.memmap(path, record, mode="r", offset=offset, shape=(whole,))), notes
+    return SeqFile(path, whole, height, width), notes
 
 
 def _read_seq(path: Path, options: Options) -> ImageSequence:

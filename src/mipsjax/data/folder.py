@@ -19,7 +19,7 @@ from mipsjax.data.framefiles import (
     rows_for_frames,
 )
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
-from mipsjax.data.trajectory import read_matrix_rows
+from mipsjax.data.trajectory import read_true_matrices
 from mipsjax.errors import InputError
 
 LAYOUT = "folder"
@@ -45,7 +45,7 @@ def read(path: Path, options: Options) -> ImageSequence:
         notes += ("no depth scale known: depth taken to be in millimetres",)
     poses = None
     if (path / "poses.txt").is_file():
-        rows, pose_notes = read_matrix_rows(path / "poses.txt")
+        rows, pose_notes = read_true_matrices(path / "poses.txt")
         poses, row_notes = rows_for_frames(rows, keys, "poses.txt")
         notes += pose_notes + row_notes
     return image_sequence(

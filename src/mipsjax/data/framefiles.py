@@ -42,6 +42,8 @@ class FrameSource(Protocol):
 
     def depth_name(self, position: int) -> Path: ...
 
+    def files(self, position: int) -> tuple[Path, ...]: ...
+
 
 @dataclass(frozen=True)
 class ImageFiles:
@@ -77,6 +79,11 @@ class ImageFiles:
         """The depth file, for messages."""
         return self.depth_paths[position] or Path("no depth file")
 
+    def files(self, position: int) -> tuple[Path, ...]:
+        """All that there are of a frame."""
+        both = self.color_paths[position], self.depth_paths[position]
+        return tuple(path for path in both if path is not None)
+
 
 def frame_key(name: str) -> FrameKey:
     """The sorting and pairing key of a name."""
@@ -104,9 +111,18 @@ def pair_by_name(
 
 
 def require_images(files: ImageFiles, folder: Path, depth_pattern: str) -> None:
-    """Raises InputError if there is no depth image at all."""
+    """Raises InputError if there is no depth image at all, or none that goes with a colour image."""
     if not any(files.depth_paths):
         raise InputError(f"{folder}: no depth images ({depth_pattern})")
+    places = list(zip(files.color_paths, files.depth_paths, strict=True))
+    if any(files.color_paths) and not any(color and depth for color, depth in places):
+        color, depth = (
+            next(path for path in paths if path) for paths in (files.color_paths, files.depth_paths)
+        )
+        raise InputError(
+            f"{folder}: no colour image has the number of a depth image, the first are {color.name} and "
+            f"{depth.name}; rename them, so that those of one moment have the same"
+        )
 
 
 def frame_numbers(keys: list[FrameKey]) -> list[int] | None:
@@ -125,7 +141,8 @@ def frame_numbers(keys: list[FrameKey]) -> list[int] | None:
 def numbered_times(keys: list[FrameKey], fps: float) -> Float64[np.ndarray, "N"]:
     """Seconds from the first frame; a number left out in the names is time that passed."""
     numbers = frame_numbers(keys) or list(range(len(keys)))
-    return (np.array(numbers, dtype=np.float64) - numbers[0]) / fps if numbers else np.zeros(0)
+    # Whole numbers are subtracted: floats of twenty digits would all be one
+    return np.array([number - numbers[0] for number in numbers], dtype=np.float64) / fps
 
 
 def rows_for_frames(

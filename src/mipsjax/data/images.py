@@ -17,16 +17,24 @@ import numpy as np
 from jaxtyping import Float32, Num, UInt8, UInt16
 
 from mipsjax.errors import InputError
+from mipsjax.files import read_regular
 
 SATURATED = 65535
 """The value of a 16-bit depth image that means out of range; 0 means nothing seen."""
 
 DEPTH_BITS = 16
+MOST_PIXELS = 1 << 25
+"""Of an image: more than any camera of depth has, and 100 MB of colour."""
+LARGEST_FILE_BYTES = 1 << 28
+"""Of an image file."""
 _HEADER_BYTES = 65536
 """Enough for nearly all headers; some JPEGs carry more of thumbnails and profiles before their size."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_PNG_PIXELS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"})
+_PNG_AROUND = 12
+"""Bytes of a chunk beside its content: length, name and checksum."""
 _JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _JPEG_START_OF_SCAN = 0xDA
@@ -45,20 +53,23 @@ class ImageHeader(NamedTuple):
 
 def parse_header(data: bytes) -> ImageHeader | None:
     """Size and type from the first bytes of a PNG or JPEG; None for anything else or anything damaged."""
+    header = None
     if data.startswith(_PNG_SIGNATURE):
-        return _png_header(data)
-    if data.startswith(_JPEG_SIGNATURE):
-        return _jpeg_layout(data)[0]
-    return None
+        header = _png_header(data)
+    elif data.startswith(_JPEG_SIGNATURE):
+        header = _jpeg_layout(data)[0]
+    return header if header and header.width > 0 and header.height > 0 else None
 
 
 def read_header(path: Path) -> ImageHeader | None:
     """Size and type of an image file; None if it is missing, unreadable or neither PNG nor JPEG."""
     try:
+        if not path.is_file():  # a pipe would block
+            return None
         with path.open("rb") as file:
             start = file.read(_HEADER_BYTES)
-            return parse_header(start) or parse_header(start + file.read())
-    except OSError:
+            return parse_header(start) or parse_header(start + file.read(LARGEST_FILE_BYTES))
+    except (OSError, ValueError):  # the name may hold a NUL
         return None
 
 
@@ -104,19 +115,29 @@ def depth_to_metres(
 def _decode(path: Path, flags: int, kind: str) -> tuple[np.ndarray | None, str]:
     """Pixels, or None with `missing_<kind>: ...` or `unreadable_<kind>: ...`."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path, LARGEST_FILE_BYTES)
     except FileNotFoundError:
         return None, f"missing_{kind}: {path.name}"
     except OSError as error:
         return None, f"unreadable_{kind}: {path.name}: {error.strerror or error}"
-    damage = find_damage(data)
+    damage = find_damage(data) or _beyond(data)
     if damage:
         return None, f"unreadable_{kind}: {path.name}: {damage}"
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        pixels = cv2.imdecode(np.frombuffer(_pixels_only(data), np.uint8), flags)
     except cv2.error:
         pixels = None
     return pixels, "" if pixels is not None else f"unreadable_{kind}: {path.name}: cannot be decoded"
+
+
+def _beyond(data: bytes) -> str:
+    """Why an image is not decoded at all: its size is known before a byte of memory is taken for its pixels."""
+    header = parse_header(data)
+    if header is None:
+        return "neither PNG nor JPEG"
+    if header.width * header.height > MOST_PIXELS:
+        return f"{header.width} x {header.height} pixels, at most {MOST_PIXELS} are read"
+    return ""
 
 
 def find_damage(data: bytes) -> str:
@@ -131,6 +152,21 @@ def find_damage(data: bytes) -> str:
         # a scan the byte FF is always followed by 00 or a restart marker.
         return "" if scan and data.find(_JPEG_END, scan) >= 0 else "truncated JPEG"
     return ""
+
+
+def _pixels_only(data: bytes) -> bytes:
+    """A whole PNG without what is no pixel, such as colour profiles, of which libpng complains on stderr; any other
+    image as it is."""
+    if not data.startswith(_PNG_SIGNATURE):
+        return data
+    kept, at = [_PNG_SIGNATURE], len(_PNG_SIGNATURE)
+    while at + _PNG_AROUND <= len(data):
+        (length,) = struct.unpack(">I", data[at : at + 4])
+        end = at + _PNG_AROUND + length
+        if data[at + 4 : at + 8] in _PNG_PIXELS:
+            kept.append(data[at:end])
+        at = end
+    return b"".join(kept)
 
 
 def _png_header(data: bytes) -> ImageHeader | None:

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int, UInt8, UInt16
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
 from mipsjax.data.association import sort_stamps
 from mipsjax.data.calibration import Calibration, DepthScale, Size, resolve_intrinsics, same_aspect
 from mipsjax.data.framefiles import FrameSource
 from mipsjax.data.images import DEPTH_BITS, ImageHeader, depth_to_metres, depth_type_message
 from mipsjax.data.sequence import Frame
+from mipsjax.data.suspicion import suspicions_of_view
 from mipsjax.errors import InputError
 
 PROBES = 15
@@ -95,6 +97,10 @@ class ImageSequence:
         units = self.depth_scale.units_per_metre
         return None if raw is None else depth_to_metres(raw, units, 0.0, float("inf"))
 
+    def files(self, position: int) -> tuple[Path, ...]:
+        """Those that a frame is read from."""
+        return self.source.files(int(self.positions[position]))
+
     def select(self, frames: slice) -> ImageSequence:
         """The frames of a slice; they keep their numbers. Nothing is read."""
         poses = None if self.T_world_cam is None else self.T_world_cam[frames]
@@ -151,6 +157,7 @@ def image_sequence(
     depth_size = _depth_size(source)
     color_size, size_notes = _color_size(source, depth_size)
     native, intrinsics_notes = resolve_intrinsics(calibration, color_size, depth_size)
+    view_notes = suspicions_of_view(native, calibration.source)
     every_px = max(1, round(depth_size[0] / input.working_width))
     if T_world_cam is not None and not np.isfinite(T_world_cam).any():
         T_world_cam = None
@@ -160,7 +167,7 @@ def image_sequence(
         intrinsics=native.decimated(every_px),
         timestamps=timestamps[order],
         T_world_cam=None if T_world_cam is None else T_world_cam[order],
-        notes=notes + order_notes + size_notes + intrinsics_notes,
+        notes=notes + order_notes + size_notes + intrinsics_notes + view_notes,
         source=source,
         positions=order,
         numbers=np.arange(len(order)),

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.data import fastcamo, folder, replica, scannet, sevenscenes, tum
-from mipsjax.data.calibration import DepthScale, Options, declared_intrinsics
+from mipsjax.data.calibration import DEPTH_UNITS, DepthScale, Options, declared_intrinsics
 from mipsjax.data.imagesequence import ImageSequence
 from mipsjax.data.sequence import Sequence
+from mipsjax.data.suspicion import suspicions_of_depth, suspicions_of_times
 from mipsjax.data.trajectory import known_poses
 from mipsjax.errors import ConfigError, InputError
 
@@ -80,9 +81,18 @@ def open_sequence(
     if str(path).startswith(SYNTH_PREFIX):
         from mipsjax.data.synth import open_synth
 
-        return open_synth(str(path).removeprefix(SYNTH_PREFIX), frames, input)
-    if depth_scale is not None and not 0 < depth_scale < float("inf"):
-        raise ConfigError(f"--depth-scale must be a positive number of units per metre, got {depth_scale:g}")
+        synthetic = open_synth(str(path).removeprefix(SYNTH_PREFIX), frames, input)
+        given = {"--layout": layout, "--intrinsics": intrinsics, "--depth-scale": depth_scale}
+        unused = [name for name, value in given.items() if value is not None]
+        if unused:
+            synthetic.notes += (f"{' and '.join(unused)} left out: {path} has its own",)
+        return synthetic
+    low, high = DEPTH_UNITS
+    if depth_scale is not None and not low <= depth_scale <= high:
+        raise ConfigError(
+            f"--depth-scale must be a positive number of units per metre, from {low:g} to {high:g}, got "
+            f"{depth_scale:g}"
+        )
     options = Options(
         intrinsics=None if intrinsics is None else declared_intrinsics(intrinsics),
         depth_scale=None if depth_scale is None else DepthScale(depth_scale, "--depth-scale"),
@@ -98,7 +108,7 @@ def open_sequence(
         hint = "; make it readable, as by chmod -R u+rX" if isinstance(error, PermissionError) else ""
         what, why = error.filename or place, error.strerror or error
         raise InputError(f"{what}: cannot be read ({why}){hint}") from error
-    return sequence.with_notes(check_depth_scale(sequence))
+    return sequence.with_notes(check_depth_scale(sequence) + suspicions(sequence))
 
 
 def detect_layout(path: Path) -> str:
@@ -139,6 +149,18 @@ def check_depth_scale(sequence: ImageSequence) -> tuple[str, ...]:
     if not DEPTH_USUAL_M[0] <= median <= DEPTH_USUAL_M[1]:
         return (f"{found}: is --depth-scale right?",)
     return ()
+
+
+def suspicions(sequence: ImageSequence) -> tuple[str, ...]:
+    """Remarks on a recording that may not be what it is taken for; each names what would mend it."""
+    position, _ = typical_depth(sequence)
+    depth = sequence.unclipped_depth(position)
+    assert depth is not None, "a frame of typical depth has one"
+    units = sequence.depth_scale.units_per_metre
+    found = suspicions_of_depth(depth, units, sequence.input.depth_max, int(sequence.numbers[position]))
+    if sequence.layout != tum.LAYOUT:  # others number their frames: their times are ours
+        return found
+    return found + suspicions_of_times(sequence.timestamps, sequence.numbers)
 
 
 def typical_depth(sequence: ImageSequence) -> tuple[int, float]:

@@ -14,6 +14,7 @@ from mipsjax.data.calibration import (
     frame_rate,
     json_depth_scale,
     json_number,
+    json_side,
     read_json,
     with_camera_file,
 )
@@ -27,7 +28,7 @@ from mipsjax.data.framefiles import (
     rows_for_frames,
 )
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
-from mipsjax.data.trajectory import read_matrix_rows
+from mipsjax.data.trajectory import read_true_matrices
 from mipsjax.errors import InputError
 
 LAYOUT = "replica"
@@ -58,7 +59,7 @@ def read(path: Path, options: Options) -> ImageSequence:
     fps, rate_notes = frame_rate(options)
     poses = None
     if (path / "traj.txt").is_file():
-        rows, pose_notes = read_matrix_rows(path / "traj.txt")
+        rows, pose_notes = read_true_matrices(path / "traj.txt")
         poses, row_notes = rows_for_frames(rows, keys, "traj.txt")
         notes += pose_notes + row_notes
     return image_sequence(
@@ -94,11 +95,10 @@ def _camera_params(path: Path, options: Options) -> tuple[Calibration, DepthScal
     camera = content.get("camera", content)
     if not isinstance(camera, dict):
         raise InputError(f"{file}: 'camera' must hold the values w, h, fx, fy, cx, cy, scale")
-    width, height, fx, fy, cx, cy = (
-        json_number(camera, name, file) for name in ("w", "h", "fx", "fy", "cx", "cy")
-    )
+    width, height = json_side(camera, "w", file), json_side(camera, "h", file)
+    fx, fy, cx, cy = (json_number(camera, name, file) for name in ("fx", "fy", "cx", "cy"))
     scale = json_depth_scale(camera, "scale", file)
-    return Calibration(fx, fy, cx, cy, (int(width), int(height)), file.name), scale, ()
+    return Calibration(fx, fy, cx, cy, (width, height), file.name), scale, ()
 
 
 def _number(path: Path) -> str:

@@ -8,14 +8,19 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.errors import InputError
+from mipsjax.files import read_regular
+
+LARGEST_TEXT_BYTES = 1 << 28
+"""Of a list or a trajectory: millions of rows."""
 
 
 def read_text(path: Path) -> str:
     """The whole file as text; bytes that are not UTF-8 are replaced. Raises InputError if unreadable."""
     try:
-        return path.read_text(encoding="utf-8-sig", errors="replace")
+        text = read_regular(path, LARGEST_TEXT_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def content_lines(path: Path) -> list[tuple[int, str]]:
@@ -45,6 +50,28 @@ def read_number_rows(path: Path, count: int) -> Float64[np.ndarray, "N C"]:
     """All rows of a file of `count` numbers a row. Raises InputError on any other row."""
     rows = [parse_numbers(line, count, path, number) for number, line in content_lines(path)]
     return np.array(rows, dtype=np.float64).reshape(len(rows), count)
+
+
+def read_true_rows(path: Path, count: int) -> tuple[Float64[np.ndarray, "N C"], tuple[str, ...]]:
+    """The same of a file of truth, which must not stop a run: a malformed row is one of NaN, and remarked on.
+
+    Without any row where the file cannot be read at all.
+    """
+    try:
+        lines = content_lines(path)
+    except InputError as error:
+        return np.zeros((0, count)), (f"truth left out: {error}",)
+    rows = np.full((len(lines), count), np.nan)
+    reasons = []
+    for place, (number, line) in enumerate(lines):
+        try:
+            rows[place] = parse_numbers(line, count, path, number)
+        except InputError as error:
+            reasons.append(str(error))
+    if not reasons:
+        return rows, ()
+    remark = f"{path.name}: {len(reasons)} of {len(rows)} rows are malformed, left unknown; the first: {reasons[0]}"
+    return rows, (remark,)
 
 
 def read_number_block(path: Path, rows: int, columns: int) -> Float64[np.ndarray, "R C"]:

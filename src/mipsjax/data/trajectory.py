@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
-from mipsjax.data.textfile import read_number_block, read_number_rows
+from mipsjax.data.textfile import content_lines, read_number_block, read_number_rows, read_true_rows
 from mipsjax.errors import InputError
 from mipsjax.files import write_atomically
 
@@ -24,10 +24,14 @@ or sheared matrix is another convention, and silently mending it would hide that
 _LARGEST_ENTRY = 2.0
 """A matrix with a larger entry is no near-rotation; it is not given to the SVD, which could overflow."""
 
+FARTHEST_M = 1e8
+"""A true position beyond is a mistake: surveyed coordinates, and those of the whole Earth, are below 1e7 m."""
+
 _BOTTOM_ROW = (0.0, 0.0, 0.0, 1.0)
 _BOTTOM_ROW_TOLERANCE = 1e-3
 _SMALLEST_QUATERNION = 1e-6
 _TUM_COLUMNS = 8
+_MATRIX_COLUMNS, _KITTI_COLUMNS = 16, 12
 _TUM_HEADER = "# timestamp tx ty tz qx qy qz qw"
 
 
@@ -89,7 +93,8 @@ def clean_poses(
     poses[:, :3, :3] = project_rotations(matrices[:, :3, :3])
     with np.errstate(invalid="ignore"):
         skew = np.abs(matrices[:, 3] - np.array(_BOTTOM_ROW)) > _BOTTOM_ROW_TOLERANCE
-    rigid = finite & known_poses(poses) & ~skew.any(axis=-1)
+        near = np.abs(matrices[:, :3, 3]).max(axis=-1) <= FARTHEST_M
+    rigid = finite & known_poses(poses) & ~skew.any(axis=-1) & near
     poses[:, 3] = _BOTTOM_ROW
     poses[~rigid] = np.nan
     return poses, _remarks(finite, rigid, source)
@@ -97,7 +102,29 @@ def clean_poses(
 
 def read_matrix_rows(path: Path) -> tuple[Float64[np.ndarray, "N 4 4"], tuple[str, ...]]:
     """Poses of a file with 16 numbers a row, row-major, and remarks. Raises InputError on malformed rows."""
-    return clean_poses(read_number_rows(path, 16).reshape(-1, 4, 4), path.name)
+    return clean_poses(read_number_rows(path, _MATRIX_COLUMNS).reshape(-1, 4, 4), path.name)
+
+
+def read_true_matrices(path: Path) -> tuple[Float64[np.ndarray, "N 4 4"], tuple[str, ...]]:
+    """The same of a file of truth, which never stops a run: what cannot be read is unknown, and remarked on.
+
+    Rows of 12 numbers, as KITTI has them, lack the last row of each matrix.
+    """
+    count = _MATRIX_COLUMNS if _columns(path) != _KITTI_COLUMNS else _KITTI_COLUMNS
+    rows, malformed = read_true_rows(path, count)
+    if count == _KITTI_COLUMNS:
+        rows = np.concatenate([rows, np.tile(_BOTTOM_ROW, (len(rows), 1))], axis=1)
+    poses, remarks = clean_poses(rows.reshape(-1, 4, 4), path.name)
+    return poses, malformed + remarks
+
+
+def _columns(path: Path) -> int:
+    """Numbers in the first row of a file; 0 if it is empty or unreadable."""
+    try:
+        lines = content_lines(path)
+    except InputError:
+        return 0
+    return len(lines[0][1].replace(",", " ").split()) if lines else 0
 
 
 def read_matrix_files(
@@ -132,10 +159,23 @@ def read_tum(path: Path) -> Trajectory:
     timestamps = rows[:, 0]
     if not np.isfinite(timestamps).all():
         raise InputError(f"{path}: row {int(np.argmin(np.isfinite(timestamps))) + 1} has no finite timestamp")
+    return _of_tum_rows(rows)
+
+
+def read_true_tum(path: Path) -> tuple[Trajectory, tuple[str, ...]]:
+    """The same of a file of truth, which never stops a run: rows that cannot be read are left out, and remarked on."""
+    rows, remarks = read_true_rows(path, _TUM_COLUMNS)
+    return _of_tum_rows(rows[np.isfinite(rows[:, 0])]), remarks
+
+
+def _of_tum_rows(rows: Float64[np.ndarray, "N 8"]) -> Trajectory:
+    timestamps = rows[:, 0]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = rows[:, 1:4]
     poses[:, :3, :3] = matrix_from_quaternion(rows[:, [7, 4, 5, 6]])
-    poses[~known_poses(poses)] = np.nan
+    with np.errstate(invalid="ignore"):
+        near = np.abs(rows[:, 1:4]).max(axis=-1, initial=0.0) <= FARTHEST_M
+    poses[~known_poses(poses) | ~near] = np.nan
     return Trajectory(timestamps, poses)
 
 
@@ -163,6 +203,7 @@ def _remarks(finite: Bool[np.ndarray, "N"], rigid: Bool[np.ndarray, "N"], source
         remarks.append(f"{source}: {unknown} of {len(finite)} true poses are not finite, left unknown")
     if rejected:
         remarks.append(
-            f"{source}: {rejected} of {len(finite)} true poses rejected, left unknown (mirrored or not rigid)"
+            f"{source}: {rejected} of {len(finite)} true poses rejected, left unknown "
+            f"(mirrored, not rigid, or farther than {FARTHEST_M:g} m)"
         )
     return tuple(remarks)

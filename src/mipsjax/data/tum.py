@@ -18,7 +18,7 @@ from mipsjax.data.framefiles import ImageFiles
 from mipsjax.data.images import DEPTH_BITS, read_header
 from mipsjax.data.imagesequence import ImageSequence, image_sequence
 from mipsjax.data.textfile import content_lines, parse_number
-from mipsjax.data.trajectory import known_poses, read_tum
+from mipsjax.data.trajectory import known_poses, read_true_tum
 from mipsjax.errors import InputError
 
 LAYOUT = "tum"
@@ -37,8 +37,12 @@ CAMERAS = {
 }
 """The three cameras of the benchmark, by the digit in the name of a sequence; from its documentation."""
 
+LEAST_OF_ITS_TIME = 0.5
+"""Share of the images of a list that must have a time of their own; with fewer, times were rounded."""
+
 _CAMERA_NAME = re.compile(r"(?<![a-z0-9])(?:freiburg|fr)([123])(?![a-z0-9])", re.IGNORECASE)
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt")
+_COLOR_LISTS = ("rgb.txt", "color.txt")
 _GROUND_TRUTH = ("groundtruth.txt", "pose.txt")
 _ASSOCIATION_WORDS = 4
 
@@ -54,7 +58,7 @@ class Listing(NamedTuple):
 
 def matches(path: Path) -> bool:
     """Whether a folder looks like this layout."""
-    listed = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+    listed = _first_file(path, _COLOR_LISTS) is not None and (path / "depth.txt").is_file()
     return listed or _first_file(path, _ASSOCIATIONS) is not None
 
 
@@ -82,7 +86,7 @@ def read(path: Path, options: Options) -> ImageSequence:
 
 def read_lists(path: Path) -> Listing:
     """Pairs from `rgb.txt` and `depth.txt`, nearest in time. Raises InputError."""
-    rgb_times, rgb_files, rgb_notes = _read_list(path / "rgb.txt")
+    rgb_times, rgb_files, rgb_notes = _read_list(_first_file(path, _COLOR_LISTS) or path / _COLOR_LISTS[0])
     depth_times, depth_files, depth_notes = _read_list(path / "depth.txt")
     try:
         rgb, depth = associate(rgb_times, depth_times)
@@ -133,12 +137,12 @@ def _calibration(path: Path, options: Options) -> tuple[Calibration, tuple[str, 
 def _poses(
     truth: Path, timestamps: Float64[np.ndarray, "N"]
 ) -> tuple[Float64[np.ndarray, "N 4 4"], tuple[str, ...]]:
-    trajectory = read_tum(truth)
+    trajectory, remarks = read_true_tum(truth)
     poses = poses_at(timestamps, trajectory)
     known = int(known_poses(poses).sum())
     if known == len(poses):
-        return poses, ()
-    return poses, (f"{truth.name}: true pose known for {known} of {len(poses)} frames",)
+        return poses, remarks
+    return poses, (*remarks, f"{truth.name}: true pose known for {known} of {len(poses)} frames")
 
 
 def _seconds(
@@ -164,6 +168,11 @@ def _read_list(path: Path) -> tuple[Float64[np.ndarray, "N"], list[Path], tuple[
         raise InputError(f"{path}: lists no images")
     stamps = np.array(times)
     order, notes = sort_stamps(stamps, path.name)
+    if len(order) < LEAST_OF_ITS_TIME * len(stamps):
+        raise InputError(
+            f"{path}: {len(stamps) - len(order)} of {len(stamps)} images have the time of another: write times with "
+            "fractions of a second"
+        )
     return stamps[order], [files[place] for place in order], notes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mipsjax.config import InputConfig
+from mipsjax.config.sections import InputConfig
 from mipsjax.data.synth.catalog import HOMES, SPECS, find
 from mipsjax.data.synth.sequence import Degradations, SynthSequence
 from mipsjax.errors import InputError

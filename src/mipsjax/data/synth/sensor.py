@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from mipsjax.core.camera import Intrinsics
+from mipsjax.core.camera import Intrinsics, rays
 
 
 class SensorModel(NamedTuple):
@@ -100,10 +100,7 @@ def incidence(depth: Float32[np.ndarray, "H W"], intrinsics: Intrinsics) -> Floa
     Of the neighbours on both sides the nearer in depth counts, so that a normal does not bridge an edge.
     """
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
-    sight = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(depth.shape)],
-        axis=-1,
-    )
+    sight = rays(v, u, intrinsics)
     points = sight * depth[..., None]
     normal = np.cross(_tangent(points, axis=1), _tangent(points, axis=0))
     lengths = np.linalg.norm(normal, axis=-1) * np.linalg.norm(sight, axis=-1)

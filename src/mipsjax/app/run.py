@@ -1,0 +1,326 @@
+"""`python -m mipsjax.run SEQUENCE`: from an RGB-D sequence to a trajectory and a mesh."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import trimesh
+from tqdm import tqdm
+
+from mipsjax.app import checkpoint, outputs, signals
+from mipsjax.app.checkpoint import Checkpoints, Progress
+from mipsjax.app.commandline import Options, bugs_saved_in, complain, ended, parse, say
+from mipsjax.app.compilation import enable_cache
+from mipsjax.app.resume import end_of, progress_in, resumed_options
+from mipsjax.app.summary import FrameRow, Run, verdict
+from mipsjax.config.sections import CheckpointConfig, Config, InputConfig, MeshConfig
+from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
+from mipsjax.data.sequence import Sequence
+from mipsjax.data.suspicion import suspicions_of_truth
+from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
+from mipsjax.mesh.reconstruct import reconstruct
+from mipsjax.slam import step as slam
+from mipsjax.slam.finish import finish
+from mipsjax.slam.info import FrameInfo
+from mipsjax.slam.judge import judged
+from mipsjax.submaps.schedule import executor
+from mipsjax.submaps.state import Pose, SlamState, Status, trajectory
+
+log = logging.getLogger(__name__)
+
+LINE_EVERY = 50
+"""Frames between two lines of progress where there is no terminal."""
+MIN_USABLE = 2
+"""Frames that make a sequence."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program; returns its exit code. Errors are one line on stderr."""
+    return ended(lambda: _main(sys.argv[1:] if arguments is None else arguments))
+
+
+def travel(
+    sequence: Sequence,
+    cfg: Config,
+    stop: Callable[[], bool],
+    tell: Callable[[Status], None],
+    kept: Checkpoints,
+    before: Progress = Progress(),  # noqa: B008 (a value)
+) -> Run:
+    """All frames in turn, after those of `before`, until `stop` says so or too many are bad. `tell` hears the status
+    of each, and `kept` writes checkpoints.
+
+    The map starts with the first frame that has colour and enough depth; frames before it are passed over.
+    """
+    state, bad, core = before.state, before.bad, _of_the_method(cfg)
+    waited, infos = list(before.waited), list(before.infos)
+    read_s, step_s = list(before.read_s), list(before.step_s)
+
+    def progress() -> Progress:
+        return Progress(state, tuple(waited), tuple(infos), tuple(read_s), tuple(step_s), bad)
+
+    with executor(cfg.background.executor) as beside:
+        for position in range(len(read_s), len(sequence)):
+            if stop() or bad > cfg.input.max_bad_frames:
+                break
+            began = perf_counter()
+            frame = sequence[position]
+            read_s.append(perf_counter() - began)
+            if state is not None:
+                state, info = slam.step(state, frame, core, beside)
+                infos.append(info)
+            elif reason := slam.anchor_problem(frame):
+                waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
+            else:
+                state, info = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
+                infos.append(info)
+            step_s.append(perf_counter() - began - read_s[-1])
+            status = Status.SKIPPED if state is None else state.records[-1].status
+            bad += status is Status.SKIPPED
+            if state is not None:
+                waited_ms = kept.after(infos[-1].keyframe, progress)
+                infos[-1] = infos[-1]._replace(checkpoint_ms=waited_ms)
+            tell(status)
+        interrupted = len(read_s) < len(sequence) and bad <= cfg.input.max_bad_frames
+        if interrupted and state is not None:
+            kept.last(progress())
+        began = perf_counter()
+        if state is not None:
+            state = finish(state, core, beside)
+    finish_s = perf_counter() - began
+    too_bad = bad > cfg.input.max_bad_frames
+    end = "bad frames" if too_bad else "interrupted" if interrupted else "done"
+    return Run(sequence, state, tuple(waited), tuple(infos), tuple(read_s), tuple(step_s), end, finish_s)
+
+
+def _main(arguments: list[str]) -> int:
+    options = resumed_options(arguments) or parse(arguments)
+    return _inspect(options) if options.inspect else _run(options)
+
+
+def _run(options: Options) -> int:
+    """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
+    cfg, tell = options.settings, _teller(options.quiet)
+    if options.resume is not None and (end := end_of(options.resume)):
+        tell(f"{options.resume}: this run has ended ({end}), its results are there")
+        return 0
+    enable_cache()
+    began = perf_counter()
+    sequence = _open(options)
+    opened_s = perf_counter() - began
+    folder = options.resume or outputs.choose_folder(sequence.name, options.out, _source(options))
+    identity, before = checkpoint.identity(cfg, sequence), Progress()
+    with (
+        signals.noted() as stop,
+        outputs.claimed(folder) as held,
+        bugs_saved_in(folder),
+        _warnings(tell) as remarks,
+    ):
+        tell("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
+        if options.resume is None:
+            outputs.write_config(folder, cfg, _plain_options(options), sequence)
+        else:
+            before = progress_in(folder, identity)
+            checkpoint.tidy(folder)
+            remarks[:0] = before.remarks
+            tell(f"goes on after {len(before.read_s)} frames")
+        with (
+            checkpoint.checkpoints(folder, identity, cfg.checkpoint, remarks) as kept,
+            _progress(len(sequence), len(before.read_s), options.quiet) as tell_status,
+        ):
+            run = travel(sequence, cfg, stop, tell_status, kept, before)
+        state = run.state
+        if state is None:
+            raise _nothing_usable(run)
+        _return_memory()
+        began = perf_counter()
+        run = run._replace(agreement=judged(state, cfg))
+        judged_s = perf_counter() - began
+        if run.T_truth_cam is not None:
+            for remark in suspicions_of_truth(trajectory(state), run.T_truth_cam):
+                log.warning(remark)
+        if not held():
+            log.warning("%s was deleted or taken by another run meanwhile", folder)
+            folder = outputs.sibling(folder)
+            outputs.write_config(folder, cfg, _plain_options(options), sequence)
+            log.warning("the results go to %s", folder)
+        seconds = {"open": opened_s, "judge": judged_s}
+        meshing = "none" if options.no_mesh else "unfinished"
+        content = outputs.write_results(folder, run, None, seconds, remarks, meshing)
+        late = stop() and run.end == "done"
+        if not options.no_mesh:
+            began = perf_counter()
+            mesh = None if late else _mesh(state, cfg)
+            if mesh is None:
+                complain(f"interrupted: all results but the mesh are in {folder}")
+                return signals.INTERRUPTED
+            seconds["mesh"] = perf_counter() - began
+            content = outputs.write_results(folder, run, mesh, seconds, remarks, "done")
+        if run.end != "interrupted":
+            checkpoint.remove(folder)
+        tell(_summary(content))
+        return _exit_code(run, folder)
+
+
+def _mesh(state: SlamState, cfg: Config) -> trimesh.Trimesh | None:
+    """The mesh of the map; None where a signal ends it, which it does at once: everything else is written by then."""
+    try:
+        with signals.raising():
+            return reconstruct(state, cfg)
+    except KeyboardInterrupt:
+        return None
+
+
+def _return_memory() -> None:
+    """Hands back what glibc keeps although nothing uses it: over 100 MB after tracking, and the mesh needs more."""
+    with suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _exit_code(run: Run, folder: Path) -> int:
+    """0 or 130. Raises InputError or TrackingLostError where the results are not whole; they are written by
+    then."""
+    if run.end == "interrupted":
+        on = f"; --resume {folder} goes on" if checkpoint.written(folder) else ""
+        complain(f"interrupted: results up to then are in {folder}{on}")
+        return signals.INTERRUPTED
+    rows = run.rows
+    bad = [row for row in rows if row.status is Status.SKIPPED]
+    if run.end == "bad frames":
+        raise InputError(
+            f"{len(bad)} of {len(rows)} frames are unusable, the last one: {bad[-1].info.note}; results up "
+            f"to then are in {folder}; --input.max-bad-frames allows more"
+        )
+    if len(rows) - len(bad) < MIN_USABLE:
+        raise InputError(f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}")
+    if verdict(rows) == "failed":
+        lost = [row.number for row in rows if row.status is Status.LOST]
+        raise TrackingLostError(
+            f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
+            f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"
+        )
+    return 0
+
+
+def _nothing_usable(run: Run) -> MipsjaxError | KeyboardInterrupt:
+    if run.end == "interrupted":
+        return KeyboardInterrupt()
+    reason = run.waited[-1].info.note if run.waited else "none was read"
+    text = f"none of {len(run.waited)} frames has usable colour and depth, the last one: {reason}"
+    more = (
+        f"; the other {len(run.sequence) - len(run.waited)} were not read: --input.max-bad-frames allows more"
+    )
+    return InputError(text + more if run.end == "bad frames" else text)
+
+
+def _inspect(options: Options) -> int:
+    say(describe(_open(options)))
+    return 0
+
+
+def _open(options: Options) -> Sequence:
+    sequence = open_sequence(
+        options.sequence,
+        layout=options.layout,
+        intrinsics=options.intrinsics,
+        depth_scale=options.depth_scale,
+        frames=parse_frames(options.frames),
+        input=options.settings.input,
+    )
+    if len(sequence) < MIN_USABLE:
+        raise InputError(f"{options.sequence}: 1 frame selected, at least {MIN_USABLE} are needed")
+    return sequence
+
+
+def _of_the_method(cfg: Config) -> Config:
+    """The config as compiled code sees it: options of reading, meshing and saving must not compile tracking anew."""
+    return replace(cfg, input=InputConfig(), mesh=MeshConfig(), checkpoint=CheckpointConfig())
+
+
+def _true_pose(sequence: Sequence, position: int) -> Pose | None:
+    """Where the first frame is in the world, if that is known."""
+    if sequence.T_world_cam is None or not np.isfinite(sequence.T_world_cam[position]).all():
+        return None
+    return sequence.T_world_cam[position]
+
+
+def _source(options: Options) -> Path | None:
+    return None if options.sequence.startswith(SYNTH_PREFIX) else Path(options.sequence)
+
+
+def _plain_options(options: Options) -> dict[str, Any]:
+    """The command line for config.json."""
+    values = {
+        item.name: getattr(options, item.name)
+        for item in fields(options)
+        if item.name not in ("settings", "resume")
+    }
+    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+
+
+def _summary(content: dict[str, Any]) -> str:
+    """One line at the end."""
+    fps, ate = content["fps"], content.get("ate_rmse_m")
+    parts = [f"{content['status']}: {content['frames']} frames in {content['seconds']:.1f} s"]
+    parts += [f"{fps:.1f} frames/s after compilation"] if fps else []
+    parts += [f"{content['keyframes']} keyframes"]
+    parts += [f"ATE {100 * ate:.2f} cm"] if ate is not None else []
+    return ", ".join(parts)
+
+
+def _teller(quiet: bool) -> Callable[[str], None]:
+    return (lambda text: None) if quiet else say
+
+
+@contextmanager
+def _progress(count: int, before: int, quiet: bool) -> Iterator[Callable[[Status], None]]:
+    """A function that is told of each frame after those before: a bar on a terminal, or else a line now and then."""
+    if not quiet and sys.stderr.isatty():
+        bar = tqdm(total=count, initial=before, unit="frame", file=sys.stderr)
+        try:
+            yield lambda status: _advance(bar, status)
+        finally:
+            with suppress(OSError):
+                bar.close()
+        return
+    done, tell_line = [before], _teller(quiet)
+
+    def tell(status: Status) -> None:
+        done[0] += 1
+        if done[0] % LINE_EVERY == 0 or done[0] == count:
+            tell_line(f"frame {done[0]} of {count}: {status}")
+
+    yield tell
+
+
+def _advance(bar: tqdm, status: Status) -> None:
+    with suppress(OSError):  # where the terminal is closed
+        bar.set_postfix_str(str(status), refresh=False)
+        bar.update()
+
+
+@contextmanager
+def _warnings(tell: Callable[[str], None]) -> Iterator[list[str]]:
+    """Collects what the library logs, and says it."""
+    texts: list[str] = []
+
+    class Collector(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            texts.append(record.getMessage())
+            tell(f"{record.levelname.lower()}: {texts[-1]}")
+
+    handler, logger = Collector(logging.WARNING), logging.getLogger("mipsjax")
+    logger.addHandler(handler)
+    try:
+        yield texts
+    finally:
+        logger.removeHandler(handler)

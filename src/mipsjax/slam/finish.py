@@ -1,0 +1,103 @@
+"""After the last frame: loops and keyframes once more, then submaps learned where they lie, and every frame aligned."""
+
+from __future__ import annotations
+
+import logging
+
+import jax.numpy as jnp
+import numpy as np
+
+from mipsjax.config.sections import Config
+from mipsjax.core import tracking
+from mipsjax.core.rigid import rigid
+from mipsjax.slam.straighten import straightened
+from mipsjax.submaps.background import taken_over
+from mipsjax.submaps.bundle import FINISH, MAP, adjust, random_key
+from mipsjax.submaps.closure import closed_again
+from mipsjax.submaps.dormant import packed
+from mipsjax.submaps.ids import SubmapId
+from mipsjax.submaps.links import unjoined
+from mipsjax.submaps.records import Records
+from mipsjax.submaps.schedule import INLINE, Executor
+from mipsjax.submaps.state import (
+    Pose,
+    Record,
+    SlamState,
+    Submap,
+    pose_of,
+    thumbnail_stride,
+    to_metres,
+)
+from mipsjax.uncertainty.trust import ALLOWED_TRACKED, trusted
+
+log = logging.getLogger(__name__)
+
+BATCH_STEPS = 10  # of mapping on each random batch of keyframes
+ALIGNED = 16  # frames in one call of `tracking.align`
+
+
+def finish(state: SlamState, cfg: Config, executor: Executor = INLINE) -> SlamState:
+    """The state after the last frame: all loops once more, keyframes moved to where they lie by each other,
+    `map.final_steps` steps of mapping of each submap, and `track.go.final_steps` of tracking of each frame. `executor`
+    is the one that `step` was given. Warns where submaps hang on nothing."""
+    state = closed_again(taken_over(state, executor, cfg), cfg)
+    as_tracked = trusted(state.doubts, ALLOWED_TRACKED)
+    # Where submaps do not learn once more they stay bent, and so do the keyframes in them
+    state, trust = straightened(state, cfg) if cfg.map.final_steps else (state, as_tracked)
+    for submap_id in state.submap_ids:
+        state = _adjusted(state, submap_id, cfg)
+    if cfg.track.go.final_steps and cfg.track.go.method == "lm":
+        for submap_id in state.submap_ids:
+            state = _aligned(state, submap_id, trust, cfg)
+    if apart := unjoined(state):
+        log.warning(
+            "submaps %s, begun by a lost camera, were never seen to overlap the first: where they lie is a guess",
+            apart,
+        )
+    return state
+
+
+def _adjusted(state: SlamState, submap_id: SubmapId, cfg: Config) -> SlamState:
+    """Bundle adjustment at rates that fall to zero; each call takes another random batch, the anchor stays."""
+    submap = state.submaps[submap_id]
+    keyframes, learned = list(submap.keyframes), submap.learned
+    calls = -(-cfg.map.final_steps // BATCH_STEPS)  # rounded up
+    for call in range(calls):
+        rng = np.random.default_rng((cfg.seed, FINISH, submap_id, call))
+        fresh = len(keyframes) < cfg.map.frames
+        chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
+        fall = 1 - call / calls
+        rates = [cfg.map.pose_rate_slow * fall if i != 0 else 0.0 for i in chosen]
+        batch = [keyframes[i] for i in chosen]
+        key = random_key(cfg, MAP, len(state.records) + call)
+        learned, poses, _ = adjust(learned, batch, rates, BATCH_STEPS, key, state.camera, cfg, fall)
+        for i, pose in zip(chosen, poses, strict=True):
+            keyframes[i] = keyframes[i]._replace(T_sub_cam=pose)
+    kept = learned if submap_id == state.active else packed(learned)
+    return state.with_submap(submap_id, learned=kept, keyframes=tuple(keyframes))
+
+
+def _aligned(state: SlamState, submap_id: SubmapId, trust: float, cfg: Config) -> SlamState:
+    """Every trusted frame of a submap at the pose where it fits the finished map; the map's first frame stays. Colour
+    holds it where it was as far as it is trusted."""
+    small = state.camera.decimated(thumbnail_stride(state.camera))
+    submap, records = state.submaps[submap_id], list(state.records)
+    own = [i for i, r in enumerate(records) if r.submap == submap_id and r.depth is not None]
+    for begin in range(0, len(own), ALIGNED):
+        group = own[begin : begin + ALIGNED]
+        filled = [group[i % len(group)] for i in range(ALIGNED)]
+        depth = np.stack([to_metres(records[i]) for i in filled])
+        start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)
+        colour = trust * np.stack([records[i].colour for i in filled]).astype(np.float32)
+        poses = np.asarray(
+            tracking.align(submap.learned.field, jnp.asarray(depth), start, colour, small, cfg)
+        )
+        for i, pose in zip(group, poses, strict=False):
+            records[i] = _moved(records[i], rigid(pose), submap)
+    return state._replace(records=Records.of(records))
+
+
+def _moved(record: Record, T_sub_cam: Pose, submap: Submap) -> Record:
+    """The record of a frame of a submap, moved to another pose there."""
+    keyframe = submap.keyframe_of(record.keyframe)
+    return record._replace(T_keyframe_cam=np.linalg.inv(keyframe.T_sub_cam) @ T_sub_cam)

@@ -1,0 +1,340 @@
+"""The output folder: claimed, complete, atomic, and readable whatever the numbers are."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from copy import copy
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from mipsjax.app import outputs
+from mipsjax.app.summary import FrameRow, Run, metrics_content, verdict
+from mipsjax.config.presets import preset
+from mipsjax.config.sections import Config
+from mipsjax.core import mapping
+from mipsjax.core.volume import Box
+from mipsjax.data.open import open_sequence
+from mipsjax.data.synth import SynthSequence
+from mipsjax.errors import OutputError
+from mipsjax.files import write_atomically
+from mipsjax.mesh.reconstruct import observed_points, reconstruct
+from mipsjax.slam.info import FrameInfo
+from mipsjax.submaps.bundle import make_keyframe
+from mipsjax.submaps.records import Records
+from mipsjax.submaps.state import How, Loop, Record, SlamState, Status, Submap
+from mipsjax.uncertainty.agreement import Agreement, Part
+
+CFG = preset("tiny")
+WRITTEN = 8
+"""Files of a run at its end; config.json is there from the start."""
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """Three frames that were never mapped: poses and keyframes as after a run, without its time."""
+    sequence = open_sequence("synth:tiny", frames=slice(4))
+    assert isinstance(sequence, SynthSequence) and sequence.T_world_cam is not None
+    frames = [sequence[position] for position in range(4)]
+    keyframe = make_keyframe(frames[1], 0, np.eye(4), CFG, sequence.intrinsics)
+    infos = (
+        FrameInfo(),
+        FrameInfo(residual_after=float("inf"), note='no, "depth"'),
+        FrameInfo(),
+    )
+    records = tuple(
+        Record(frame.number, frame.timestamp, 0, 0, np.eye(4), status)
+        for frame, status in zip(frames[1:], (Status.OK, Status.SKIPPED, Status.OK), strict=True)
+    )
+    box = Box(np.full(3, -4.0), np.full(3, 4.0))
+    learned = mapping.create(jax.random.key(0), CFG)
+    submap = Submap(learned, box, (keyframe,), sequence.T_world_cam[1])
+    state = SlamState((submap,), 0, Records.of(records), sequence.intrinsics, 0)
+    waited = (FrameRow(0, 0.0, Status.SKIPPED, FrameInfo(note="no depth")),)
+    return Run(sequence, state, waited, infos, (0.1,) * 4, (0.2,) * 4, "done")
+
+
+def row(status: str) -> FrameRow:
+    return FrameRow(0, 0.0, Status[status.upper()], FrameInfo())
+
+
+@pytest.mark.parametrize(
+    ("statuses", "expected"),
+    [
+        ("ok ok", "ok"),
+        ("skipped ok weak skipped", "ok"),
+        ("ok lost ok", "degraded"),
+        ("ok lost lost lost ok ok", "degraded"),
+        ("ok lost lost lost ok", "failed"),
+        ("ok ok ok lost", "failed"),
+        ("ok ok ok lost skipped", "failed"),
+        ("skipped skipped", "failed"),
+        ("ok skipped skipped", "failed"),
+    ],
+)
+def test_verdict(statuses: str, expected: str) -> None:
+    assert verdict(tuple(row(status) for status in statuses.split())) == expected
+
+
+def test_a_run_whose_depth_images_contradict_each_other_is_degraded(run: Run) -> None:
+    part = Part(0.3, 0, 2)
+    contradicted = run._replace(agreement=Agreement(part, part, 20))
+    content = metrics_content(contradicted, None, {})
+    assert content["status"] == "degraded" and content["looked_through"] == 0.3
+    assert content["contradiction"] == {
+        "indices": [1, 3],
+        "timestamps": [run.rows[1].timestamp, run.rows[3].timestamp],
+        "looked_through": 0.3,
+    }
+    (reason,) = content["reasons"]
+    assert "30 %" in reason and "between frames 1 and 3" in reason
+    assert json.loads(outputs.events_jsonl(contradicted, []).splitlines()[-1])["status"] == "degraded"
+
+
+def test_a_run_whose_depth_images_agree_or_cannot_be_compared_is_ok(run: Run) -> None:
+    agreeing = metrics_content(run._replace(agreement=Agreement(Part(0.01, 0, 2), None, 20)), None, {})
+    assert (agreeing["status"], agreeing["looked_through"], agreeing["reasons"]) == ("ok", 0.01, [])
+    unknown = metrics_content(run, None, {})
+    assert (unknown["status"], unknown["looked_through"], unknown["contradiction"]) == ("ok", None, None)
+    assert "too few" in unknown["protocol"]["looked_through"]
+
+
+def test_metrics_count_what_happened(run: Run) -> None:
+    content = metrics_content(run, None, {"open": 1.0})
+    assert content["frames"] == 4 and content["status_counts"] == {
+        "ok": 2,
+        "weak": 0,
+        "lost": 0,
+        "skipped": 2,
+    }
+    assert [bad["index"] for bad in content["bad_frames"]] == [0, 2]
+    assert content["fps"] is None, "two usable frames, and both compile"
+    assert content["fps_overall"] == pytest.approx(4 / 1.2)
+    assert content["te_mean_m"] > 0 and content["seconds"] >= 2.2
+    assert (content["submaps"], content["unjoined_submaps"]) == (1, [])
+
+
+def test_metrics_name_loops_and_submaps_that_hang_on_nothing(run: Run) -> None:
+    assert run.state is not None
+    (submap,) = run.state.submaps
+    later = submap._replace(keyframes=(submap.keyframes[0]._replace(id=2),))
+    loops = tuple(Loop(2, 0, 1, How.BOX, 0.9, 0.1, 0.0, weight) for weight in (0.0, 1.0))
+    state = run.state._replace(submaps=(submap, later, submap), loops=loops)
+    content = metrics_content(run._replace(state=state), None, {})
+    assert (content["submaps"], content["unjoined_submaps"]) == (3, [1])
+    assert content["loops"] == 1 and content["loops_found"] == outputs.loops_content(state)["loops"]
+    assert [row["weight"] for row in content["loops_found"]] == [0, 1]
+
+
+def test_speed_is_that_of_usable_frames_after_the_two_that_compile(run: Run) -> None:
+    assert run.state is not None
+    first, skipped, last = run.state.records
+    records = (first, skipped, last, last)
+    state, infos = run.state._replace(records=Records.of(records)), (*run.infos, FrameInfo())
+    others = run._replace(state=state, infos=infos, waited=(), step_s=(9.0, 0.01, 9.0, 0.2))
+    assert metrics_content(others, None, {})["fps"] == pytest.approx(5.0)
+
+
+def test_a_measure_that_cannot_be_told_leaves_the_others(run: Run) -> None:
+    sequence = copy(run.sequence)
+    sequence.T_world_cam = run.sequence.T_world_cam.copy()
+    sequence.T_world_cam[2] = np.nan
+    assert run.state is not None
+    records = tuple(record._replace(status=Status.OK) for record in run.state.records)
+    content = metrics_content(
+        run._replace(sequence=sequence, state=run.state._replace(records=Records.of(records))), None, {}
+    )
+    assert content["rpe_trans_m"] is None and "RPE" in content["protocol"]["rpe_trans_m"]
+    assert content["te_mean_m"] is not None
+
+
+def test_files_are_readable_with_odd_numbers(run: Run, tmp_path: Path) -> None:
+    outputs.write_results(tmp_path, run, trimesh.Trimesh(), {"mesh": float("nan")}, ["a warning"])
+    metrics = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert metrics["seconds_per_stage"]["mesh"] is None and metrics["accuracy_m"] is None
+    lines = (tmp_path / "status.csv").read_text().splitlines()
+    assert len(lines) == 5 and lines[0].startswith(
+        "index,timestamp,status,residual_before_m,residual_after_m,"
+    )
+    assert lines[3].endswith('"no, ""depth"""') and ",inf" not in lines[3]
+    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [event["event"] for event in events] == ["bad_frame", "bad_frame", "warning", "end"]
+
+
+@pytest.mark.parametrize("call", range(WRITTEN))
+def test_47_full_disk_leaves_no_half_file(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    calls = []
+
+    def full(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) > call:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    # Rendering takes long
+    monkeypatch.setattr(outputs, "save_picture", lambda path, *_: write_atomically(path, b"a picture"))
+    with pytest.raises(OutputError, match="No space left"):
+        outputs.write_results(tmp_path, run, trimesh.creation.box(), {}, [])
+    assert len(list(tmp_path.iterdir())) == call and not (tmp_path / "metrics.json").exists()
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    outputs.write_results(tmp_path, run, trimesh.creation.box(), {}, [])
+    assert len(list(tmp_path.iterdir())) == WRITTEN
+
+
+def test_numbered_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for expected in ("a", "a-2", "a-3"):
+        folder = outputs.choose_folder("a", None, None)
+        assert folder == Path("runs") / expected
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").touch()
+    with pytest.raises(OutputError, match="finished run"):
+        outputs.choose_folder("a", folder, None)
+    assert outputs.choose_folder("a/b", None, None) == Path("runs/a-b")
+
+
+def test_lock(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    with outputs.claimed(folder):
+        with (
+            pytest.raises(OutputError, match=f"in use by another run.*{os.getpid()}"),
+            outputs.claimed(folder),
+        ):
+            pass
+        (folder / "result").touch()
+    assert [path.name for path in folder.iterdir()] == ["result"]
+    (folder / ".lock").write_text("process 1 on a machine that died\n")
+    with outputs.claimed(folder):
+        assert str(os.getpid()) in (folder / ".lock").read_text()
+
+
+@pytest.mark.parametrize("name", outputs.FILES)
+@pytest.mark.parametrize("content", ["theirs", "{}", None])
+def test_files_of_others_are_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: str | None
+) -> None:
+    """Files, and links to files elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    folder, elsewhere = tmp_path / "runs" / "a", tmp_path / "elsewhere"
+    folder.mkdir(parents=True)
+    elsewhere.write_text("theirs")
+    if content is None:
+        (folder / name).symlink_to(elsewhere)
+    else:
+        (folder / name).write_text(content)
+    with pytest.raises(OutputError, match="choose another --out"):
+        outputs.choose_folder("a", folder, None)
+    assert outputs.choose_folder("a", None, None) == Path("runs/a-2")
+    assert not outputs.is_ours(folder)
+
+
+def test_a_folder_of_ours_without_results_is_used_again(run: Run, tmp_path: Path) -> None:
+    outputs.write_config(tmp_path, CFG, {"sequence": "synth:tiny"}, run.sequence)
+    (tmp_path / "status.csv").write_text("index")
+    for name in (".status.csv.abcdefgh.part", ".status.csv.part", "status.csv.part"):
+        (tmp_path / name).touch()
+    assert outputs.is_ours(tmp_path) and outputs.choose_folder("a", tmp_path, None) == tmp_path
+    with outputs.claimed(tmp_path):
+        left = {path.name for path in tmp_path.glob("*.part")}
+    assert left == {".status.csv.part", "status.csv.part"}, "only halves of our files are removed"
+    (tmp_path / "events.jsonl").symlink_to(tmp_path / "status.csv")
+    with pytest.raises(OutputError, match=r"events\.jsonl"):
+        outputs.choose_folder("a", tmp_path, None)
+
+
+def test_a_lock_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (tmp_path / "elsewhere").write_text("process of theirs")
+    for make in (
+        lambda path: path.write_text("theirs"),
+        lambda path: path.symlink_to(tmp_path / "elsewhere"),
+        lambda path: path.symlink_to(tmp_path / "nothing"),
+        os.mkfifo,
+    ):
+        make(folder / outputs.LOCK)
+        with pytest.raises(OutputError, match="choose another --out"):
+            outputs.choose_folder("a", folder, None)
+        with pytest.raises(OutputError, match="no lock of a run"), outputs.claimed(folder):
+            pass
+        (folder / outputs.LOCK).unlink()
+    assert (tmp_path / "elsewhere").read_text() == "process of theirs"
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_folder_deleted_and_made_again_is_known_to_be_another(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    with outputs.claimed(folder) as held:
+        assert held()
+        shutil.rmtree(folder)
+        assert not held()
+        with outputs.claimed(folder) as theirs:
+            assert theirs() and not held()
+            assert outputs.sibling(folder) == tmp_path / "out-2"
+            assert outputs.sibling(folder) == tmp_path / "out-3"
+        folder.mkdir()
+        (folder / outputs.LOCK).touch()
+    assert (folder / outputs.LOCK).exists(), "it is not ours to remove"
+
+
+def test_an_empty_folder_is_not_left_behind(tmp_path: Path) -> None:
+    with outputs.claimed(tmp_path / "new"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with outputs.claimed(tmp_path):
+        pass
+    assert tmp_path.exists()
+
+
+def test_output_in_the_input_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="lies in the input"):
+        outputs.choose_folder("a", tmp_path / "deep" / "out", tmp_path)
+
+
+def test_output_in_a_circle_of_links_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    with pytest.raises(OutputError, match="links"):
+        outputs.choose_folder("a", tmp_path / "a" / "out", tmp_path / "in")
+    with pytest.raises(OutputError), outputs.claimed(tmp_path / "a"):
+        pass
+
+
+def test_observed_points_are_those_of_the_scene(run: Run) -> None:
+    assert run.state is not None and isinstance(run.sequence, SynthSequence)
+    points = observed_points(run.state, CFG)
+    distance = run.sequence.scene.distance(jnp.asarray(points))
+    # Rays end within 0.2 mm of a surface, those that graze an edge within a few millimetres
+    assert len(points) and float(jnp.abs(distance).max()) < 5e-3 and float(jnp.abs(distance).mean()) < 2e-4
+
+
+def test_53_a_field_that_is_not_finite_gives_an_empty_mesh(
+    run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert run.state is not None
+    learned = jax.tree.map(
+        lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, run.state.submap.learned
+    )
+    with jax.numpy_rank_promotion("allow"):
+        mesh = reconstruct(run.state.with_submap(0, learned=learned), CFG)
+    assert len(mesh.faces) == 0 and "mesh is empty" in caplog.text
+
+
+def test_config_file_has_no_infinity(run: Run, tmp_path: Path) -> None:
+    cfg: Config = preset("paper")
+    options: dict[str, Any] = {"sequence": "synth:tiny", "intrinsics": (1.0, float("nan"))}
+    outputs.write_config(tmp_path, cfg, options, run.sequence)
+    content = json.loads((tmp_path / "config.json").read_text(), parse_constant=pytest.fail)
+    assert (
+        content["config"]["keyframe"]["translation"] == "inf" and content["options"]["intrinsics"][1] is None
+    )
