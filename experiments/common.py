@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from mipsjax.config.sections import Config
 from mipsjax.core.camera import Intrinsics
@@ -24,7 +25,7 @@ from mipsjax.metrics.poses import absolute_error, relative_error
 from mipsjax.slam import step as slam
 from mipsjax.slam.finish import finish
 from mipsjax.slam.info import FrameInfo
-from mipsjax.submaps.state import Pose, SlamState, keyframes, map_bytes, trajectory
+from mipsjax.submaps.state import Pose, SlamState, keyframes, map_bytes, trajectory, world_pose
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("MIPSJAX_DATA", ROOT.parent / "shared" / "data"))  # real sequences
@@ -38,6 +39,9 @@ class Run(NamedTuple):
     state: SlamState
     online: SlamState
     """As it was after the last frame, before the adjustment that follows."""
+    as_it_came: Float64[np.ndarray, "N 4 4"]
+    """The world pose of each frame when it had been processed, before later ones moved it."""
+    infos: list[FrameInfo]
     sequence: Sequence
     row: dict[str, Any]
 
@@ -61,13 +65,14 @@ def run(
     truth = sequence.T_world_cam
     known = truth is not None and np.isfinite(truth[0]).all()
     state, info = slam.start(sequence[0], sequence.intrinsics, cfg, truth[0] if known else None)
-    infos = [info]
+    infos, as_it_came = [info], [world_pose(state, state.records[-1])]
     began, early = time.perf_counter(), float("nan")
     for position in range(1, len(sequence)):
         if position == WARM_UP:
             began = time.perf_counter()
         state, info = slam.step(state, sequence[position], cfg)
         infos.append(info)
+        as_it_came.append(world_pose(state, state.records[-1]))
         watch(state)
         if position == EARLY:
             early = peak_mb()
@@ -84,7 +89,8 @@ def run(
         f"peak_{EARLY}_mb": early,
         "peak_online_mb": loop_peak,
     }
-    return Run(state, online, sequence, row | figures(state, infos, sequence) | speed)
+    row |= figures(state, infos, sequence) | speed
+    return Run(state, online, np.stack(as_it_came), infos, sequence, row)
 
 
 class Altered:

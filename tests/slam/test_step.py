@@ -11,6 +11,7 @@ import pytest
 from compilations import compilations
 from mipsjax.config.presets import PRESETS
 from mipsjax.config.sections import Config, InputConfig
+from mipsjax.config.tracking import HeldConfig
 from mipsjax.data.sequence import Frame
 from mipsjax.data.synth import open_synth
 from mipsjax.slam import step as slam
@@ -181,6 +182,18 @@ def test_the_least_residual_falls_at_once_and_rises_slowly(finished, frames):
     assert 0.3 * last < below and above < 3 * last
     assert high.residual == pytest.approx(above)
     assert 0.3 * last < low.residual < 0.3 * last + 0.1 * (below - 0.3 * last)
+
+
+def test_a_frame_is_weak_where_its_submap_may_be_elsewhere(finished, frames):
+    """However well it fits there; it moves and teaches as ever."""
+    slack = replace(CFG, track=replace(CFG.track, held=HeldConfig()))
+    near, said = slam.step(finished, following(frames[-1]), slack)
+    assert near.records[-1].status is Status.OK and said.world_deviation_m < 0.1
+    loose = finished.with_submap(0, covariance=np.diag([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]) ** 2)
+    far, said = slam.step(loose, following(frames[-1]), slack)
+    assert far.records[-1].status is Status.WEAK and 0.2 <= said.world_deviation_m < 0.25
+    assert far.frames_in_trouble == 0
+    np.testing.assert_array_equal(trajectory(far), trajectory(near))
 
 
 def test_the_motion_is_that_between_the_last_trusted_frames(finished, frames):

@@ -67,14 +67,14 @@ def without_rejected(given: SlamState, weights) -> SlamState:
     """Without the keyframes of rejected pairs, all else as it is."""
     poses = tuple(s.T_world_sub for s in given.submaps)
     dropped = tuple(rejected_keyframes(given, weights))
-    return closure.commit(given, Judgement((), dropped, poses, given.loops))
+    return closure.commit(given, Judgement((), dropped, poses, given.loops), CFG)
 
 
 def close(given: SlamState, sightings: list[Sighting], cfg: Config = CFG) -> SlamState:
     """After the newest keyframe was found in submaps by their boxes."""
     newest = given.submap.keyframes[-1]
     proposals = [proposed(given, given.active, newest, sighting, How.BOX) for sighting in sightings]
-    return closure.commit(given, closure.judge(given, proposals, cfg))
+    return closure.commit(given, closure.judge(given, proposals, cfg), cfg)
 
 
 def off(given: SlamState, truth: list[np.ndarray]) -> float:
@@ -146,7 +146,7 @@ def test_a_proposal_that_closes_a_false_loop_is_not_accepted(ring):
     (wrong,) = [proposed(before, 4, keyframe(200), Sighting(1, ELSEWHERE, 0.9), How.BOX)]
     judgement = closure.judge(before, [wrong], CFG)
     assert judgement.accepted == () and judgement.dropped == ()
-    after = closure.commit(before, judgement)
+    after = closure.commit(before, judgement, CFG)
     assert [s.keyframes for s in after.submaps] == [s.keyframes for s in before.submaps]
     assert [(loop.record, loop.first, loop.second, loop.weight) for loop in after.loops] == [(200, 4, 1, 0)]
 
@@ -181,7 +181,7 @@ def test_a_loop_is_closed_and_written_down(chain, monkeypatch, how):
     judgement = closure.judge(before, proposals, CFG)
     assert all(s.keyframes is old for s, old in zip(before.submaps, kept, strict=True))
     assert judgement.accepted == tuple(proposals) and len(proposals) == 1
-    after = closure.commit(before, judgement)
+    after = closure.commit(before, judgement, CFG)
     assert after.submaps[0].keyframes == (*kept[0], proposals[0].link.second)
     assert asked == [[1, 2] if how is How.BOX else [0, 1, 2]], "where a first link would be a loop"
     metres, radians = distance(given.submap.T_world_sub @ T_LAST_CAM, found.T_sub_cam)

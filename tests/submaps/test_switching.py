@@ -13,9 +13,11 @@ from mipsjax.config.presets import PRESETS
 from mipsjax.core import mapping
 from mipsjax.slam import recovery
 from mipsjax.submaps import switching
+from mipsjax.submaps.astray import deviations_from_first
 from mipsjax.submaps.proposals import Sighting, proposed, with_links
 from mipsjax.submaps.state import How, SlamState
 from mipsjax.submaps.switching import NEW, NOT_FINITE, STAY, enter, govern
+from mipsjax.uncertainty.held import OPEN
 
 CFG = PRESETS["tiny"]
 NEWEST = maps.pose(translation=(0.5, 0.0, 0.0))
@@ -57,6 +59,25 @@ def test_a_new_submap_that_is_not_finite_is_not_entered(state, monkeypatch):
     fits_not(monkeypatch, switching)
     after, problem = enter(state, NEW, CFG)
     assert after is state and problem == NOT_FINITE
+
+
+LOOSE = np.diag([0.0, 0.0, 0.0, 0.0, 0.05, 0.0]) ** 2
+SHORT = replace(CFG, map=replace(CFG.map, submap_steps=1))
+
+
+def test_a_new_submap_is_as_far_off_as_the_frame_that_it_is_begun_at(state):
+    *before, newest = state.submap.keyframes
+    loose = state.with_submap(1, keyframes=(*before, newest._replace(covariance=LOOSE)), covariance=LOOSE)
+    after, problem = enter(loose, NEW, SHORT)
+    assert not problem and after.submap.parent == 1
+    np.testing.assert_allclose(after.submap.covariance, 2 * LOOSE, atol=1e-12)
+
+
+def test_a_submap_of_a_lost_camera_may_be_anywhere(state):
+    found = recovery.start_anew(state, maps.keyframe(10), SHORT)
+    assert found is not None
+    metres, _ = deviations_from_first(found.state, found.state.active, found.covariance, found.T_sub_cam)
+    assert metres >= OPEN
 
 
 def test_a_lost_camera_begins_no_submap_that_is_not_finite(state, monkeypatch):

@@ -171,8 +171,8 @@ class HeldConfig:
     weak: float = 0.03
     """Metres (or as many rad): a frame is weak where measurements leave a direction open by this standard deviation."""
     unsure: float = 0.1
-    """Metres: a frame is also weak where the camera may be this far off in its submap, standard deviation, after all
-    that led there; keyframes that seem near may then be elsewhere."""
+    """Metres: a frame is also weak where the camera may be this far off from where the map began, standard deviation,
+    after all that led there. Where it is that in its submap alone, keyframes that seem near may be elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,9 @@ class FrameInfo(NamedTuple):
     """Of keeping the submaps in order: boxes, links, loops, a new submap."""
     checkpoint_ms: float = 0.0
     """That the program waited for a checkpoint after it."""
+    world_deviation_m: float = 0.0
+    """Standard deviation of where the camera was relative to where the map began, as the frame came; after a loop that
+    it closed, which its status is not."""
     note: str = ""
 
 

@@ -22,7 +22,7 @@ class FrameStats(NamedTuple):
     open: float
     """Standard deviation, metres or rad, along the direction that measurements hold least."""
     astray: float
-    """Metres, standard deviation of where the camera is in its submap, after all that led there."""
+    """Metres, standard deviation of where the camera is relative to where the map began, after all that led there."""
     residual: float
     """Metres."""
     least_residual: float
@@ -96,8 +96,8 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
-    astray = stats.astray > cfg.track.held.unsure
-    return Status.WEAK if _is_weak(stats, cfg) or astray else Status.OK
+    near = stats.astray <= cfg.track.held.unsure  # not so either where it is not finite
+    return Status.OK if near and not _is_weak(stats, cfg) else Status.WEAK
 
 
 def _is_weak(stats: FrameStats, cfg: Config) -> bool:

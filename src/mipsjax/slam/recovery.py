@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mipsjax.config.sections import Config
+from mipsjax.submaps.astray import ANYWHERE
 from mipsjax.submaps.bundle import nearest
 from mipsjax.submaps.recognition import recognise
 from mipsjax.submaps.state import Keyframe, Pose, SlamState, Status, world_pose
@@ -53,5 +54,6 @@ def start_anew(state: SlamState, keyframe: Keyframe, cfg: Config) -> Relocation 
     submap, ok = begin(keyframe, [], last_seen, cfg.map.submap_steps, state.camera, cfg)
     if not ok:
         return None
+    submap = submap._replace(covariance=ANYWHERE)
     state = state._replace(submaps=(*state.submaps, submap))
     return Relocation(activated(state, state.submap_ids[-1]), submap.anchor, np.eye(4), NONE)

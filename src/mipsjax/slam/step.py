@@ -22,6 +22,7 @@ from mipsjax.slam.landmarks import corners_of, with_corners
 from mipsjax.slam.policy import Decision, FrameStats, decide
 from mipsjax.slam.recovery import find_again, lost_in_a_row, start_anew
 from mipsjax.slam.tracker import Tracked, coasting, last_trusted, track
+from mipsjax.submaps.astray import deviations_from_first
 from mipsjax.submaps.background import refine_inactive, taken_over
 from mipsjax.submaps.bundle import CHOOSE, MAP, adjust_submap, choose, make_keyframe, random_key
 from mipsjax.submaps.closure import commit, judge, prepare, propose
@@ -40,7 +41,7 @@ from mipsjax.submaps.state import (
     thumbnail,
 )
 from mipsjax.submaps.switching import NOT_FINITE, STAY, begin, enter, govern, with_grown_box
-from mipsjax.uncertainty.held import at, deviations
+from mipsjax.uncertainty.held import at
 from mipsjax.uncertainty.trust import RECENT
 
 ANCHOR_MEASURED = 0.1
@@ -95,7 +96,16 @@ def step(
     Returns the state after it, and what there is to say about the frame. `executor` refines inactive submaps
     meanwhile; the result is the same to the bit with any (`submaps/schedule.py`).
     """
-    frame = checked_frame(frame, state.camera)
+    state, info = _processed(state, checked_frame(frame, state.camera), cfg, executor)
+    newest = state.records[-1]
+    metres, _ = deviations_from_first(state, newest.submap, newest.held.covariance, pose_of(state, newest))
+    return state, info._replace(world_deviation_m=metres)
+
+
+def _processed(
+    state: SlamState, frame: Frame, cfg: Config, executor: Executor
+) -> tuple[SlamState, FrameInfo]:
+    """The state after a frame that was checked."""
     if frame.depth is None or not frame.depth.any():
         return _coast(state, frame, frame.problem or "no depth", Status.SKIPPED, cfg)
     tracked = track(state, frame, cfg)
@@ -128,7 +138,7 @@ def _order(state: SlamState, cfg: Config, executor: Executor) -> tuple[SlamState
     """
     state = with_grown_box(state, cfg)
     judgement = judge(state, propose(state, cfg), cfg)
-    state = commit(state, judgement)
+    state = commit(state, judgement, cfg)
     choice = govern(state, judgement.accepted, cfg)
     if choice != STAY:
         return enter(taken_over(state, executor, cfg), choice, cfg)
@@ -265,7 +275,7 @@ def _stats(state: SlamState, depth: np.ndarray, tracked: Tracked, cfg: Config) -
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
         open=float(tracked.together.deviation[-1]),
-        astray=deviations(tracked.held.covariance, T_sub_cam)[0],
+        astray=deviations_from_first(state, state.active, tracked.held.covariance, T_sub_cam)[0],
         residual=float(info.after.residual),
         least_residual=state.residual,
         unsure=state.records[-1].status in (Status.LOST, Status.SKIPPED),

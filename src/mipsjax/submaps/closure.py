@@ -16,6 +16,7 @@ from mipsjax.config.sections import Config
 from mipsjax.core.rigid import distance
 from mipsjax.loops.factors import Factor
 from mipsjax.submaps import surfaces
+from mipsjax.submaps.astray import with_covariances
 from mipsjax.submaps.ids import RecordId, SubmapId
 from mipsjax.submaps.links import (
     SubmapPair,
@@ -93,14 +94,17 @@ def judge(state: SlamState, proposals: Sequence[Proposal], cfg: Config) -> Judge
     return _by_pose_graph(state, proposals, loops, cfg)
 
 
-def commit(state: SlamState, judgement: Judgement) -> SlamState:
+def commit(state: SlamState, judgement: Judgement, cfg: Config) -> SlamState:
     """The state after a judgement: with the accepted links, without the dropped keyframes, submaps where they lie."""
+    # Where nothing is joined or parted anew, submaps are as far off as they were
+    changed = judgement.accepted or judgement.dropped or judgement.loops != state.loops
     state = with_links(state, judgement.accepted)
     for submap_id, keyframe_id in judgement.dropped:
         state = unlinked(state, submap_id, keyframe_id)
     for submap_id, T_world_sub in zip(state.submap_ids, judgement.T_world_sub, strict=True):
         state = state.with_submap(submap_id, T_world_sub=T_world_sub)
-    return state._replace(loops=judgement.loops)
+    state = state._replace(loops=judgement.loops)
+    return with_covariances(state, cfg) if changed else state
 
 
 def closed_again(state: SlamState, cfg: Config) -> SlamState:
@@ -111,9 +115,9 @@ def closed_again(state: SlamState, cfg: Config) -> SlamState:
     proposals = propose_again(state, cfg) if cfg.loop.features else []
     pairs = linked_pairs(with_links(state, proposals))
     if all(state.submaps[second].parent == first for first, second in pairs):
-        return commit(state, _accepting(state, proposals))
+        return commit(state, _accepting(state, proposals), cfg)
     loops = {proposal.pair for proposal in proposals}
-    return commit(state, _by_pose_graph(state, proposals, loops, cfg))
+    return commit(state, _by_pose_graph(state, proposals, loops, cfg), cfg)
 
 
 def propose_again(state: SlamState, cfg: Config) -> list[Proposal]:

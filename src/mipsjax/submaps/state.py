@@ -87,6 +87,9 @@ class Submap(NamedTuple):
     T_world_sub: Pose
     parent: SubmapId | None = None
     """The submap whose keyframe its anchor is; None for the first, and where the camera had been lost."""
+    covariance: Matrix = NONE
+    """Of its pose relative to the first submap, for a twist in the frame of that one, as it was when it was last found
+    out how they lie (`submaps/astray.py`)."""
 
     @property
     def anchor(self) -> Keyframe:

@@ -10,6 +10,7 @@ from mipsjax.config.sections import Config
 from mipsjax.core import mapping, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.rigid import inverse, transform
+from mipsjax.submaps.astray import begun_at
 from mipsjax.submaps.bundle import INIT, MAP, adjust, adjust_submap, choose, mapping_camera, random_key
 from mipsjax.submaps.dormant import packed, unpacked
 from mipsjax.submaps.ids import RecordId, SubmapId
@@ -97,7 +98,8 @@ def _begin_here(state: SlamState, cfg: Config) -> tuple[SlamState, str]:
     new, ok = begin(first, support, T_world_sub, steps, state.camera, cfg)
     if not ok:
         return state, NOT_FINITE
-    new = new._replace(parent=state.active)
+    covariance = begun_at(state, state.active, anchor.covariance)
+    new = new._replace(parent=state.active, covariance=covariance)
     state = state._replace(submaps=(*state.submaps, new))
     return moved_in(state, state.submap_ids[-1], anchor.id), ""
 

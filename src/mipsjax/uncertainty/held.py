@@ -162,8 +162,10 @@ def deviations(covariance: Matrix, T_sub_cam: Pose) -> tuple[float, float]:
     """Standard deviations of the camera's centre, metres, and of its orientation, radians; each over all directions."""
     # A twist about the submap's origin moves the camera at t by v + omega x t = v - [t]x omega
     centre = np.concatenate([np.eye(3), -cross(T_sub_cam[:3, 3])], axis=1)
-    shift = centre @ covariance @ centre.T
-    return float(np.sqrt(np.trace(shift))), float(np.sqrt(np.trace(covariance[3:, 3:])))
+    shift, turn = centre @ covariance @ centre.T, covariance[3:, 3:]
+    # A variance of nothing may be rounded to less
+    metres, radians = np.sqrt(np.maximum([np.trace(shift), np.trace(turn)], 0))
+    return float(metres), float(radians)
 
 
 def _bounded(cross: Matrix, first: Matrix, second: Matrix) -> Matrix:
