@@ -32,12 +32,12 @@ def painting(seed: int = 0) -> np.ndarray:
     return np.clip(sum(layers) * 80, 0, 255).astype(np.uint8)
 
 
-def wall(T_wall_cam: np.ndarray, painted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brightness and depth of the painted plane z = RANGE_M, seen from a pose."""
+def wall(T_wall_cam: np.ndarray, painted: np.ndarray, z: float = RANGE_M) -> tuple[np.ndarray, np.ndarray]:
+    """Brightness and depth of the painted plane at `z`, metres, seen from a pose."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(np.float64)
     ray = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], -1)
     slope = ray @ T_wall_cam[:3, :3].T
-    depth = (RANGE_M - T_wall_cam[2, 3]) / slope[..., 2]
+    depth = (z - T_wall_cam[2, 3]) / slope[..., 2]
     at = T_wall_cam[:3, 3] + slope * depth[..., None]
     x, y = ((at[..., :2] + 2) * FINE_PX_PER_M).astype(np.float32).transpose(2, 0, 1)
     return cv2.remap(painted, x, y, cv2.INTER_AREA), depth.astype(np.float32)

@@ -11,6 +11,7 @@ from mipsjax.config.sections import Config
 from mipsjax.core.camera import project, rays
 from mipsjax.core.equations import Points, System, descend
 from mipsjax.core.photometric import (
+    EDGE_PX,
     FEWEST,
     LEVELS,
     Images,
@@ -142,7 +143,8 @@ def test_points_are_the_steepest_pixels_and_each_image_has_others():
 
 
 def test_beside_an_edge_of_depth_no_pixel_is_compared():
-    """There it is not known which side a change of brightness belongs to; a smoothed gradient reaches two pixels."""
+    """There it is not known which side a change of brightness belongs to, and a moving camera blurs one over the other;
+    beside pixels that were not measured a smoothed gradient reaches two pixels."""
     grey, depth = wall(SECOND, PAINTED)
     grey = np.where(np.arange(CAMERA.width) < 160, grey // 2, 255 - grey // 2)
     depth[:, 160:] -= 0.5
@@ -150,7 +152,7 @@ def test_beside_an_edge_of_depth_no_pixel_is_compared():
     shade = pyramid(usual(), jnp.asarray(grey, jnp.float32), jnp.asarray(depth), 1, CAMERA, CFG)[0]
     p_cam = np.asarray(shade.p_cam)[np.asarray(shade.measured)]
     u, v = np.rint(np.asarray(project(jnp.asarray(p_cam), CAMERA)).T)
-    assert len(u) > 1000 and not np.isin(u, (158, 159, 160, 161)).any() and v.min() > 41
+    assert len(u) > 1000 and np.abs(u - 159.5).min() > EDGE_PX and v.min() > 41
 
 
 @pytest.mark.parametrize("every", [1, 2, 4, 7])

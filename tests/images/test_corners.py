@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mipsjax.images.corners import Corners, corners, follow
-from painted import CAMERA, RANGE_M, painting, pose, wall
+from mipsjax.core.rigid import from_twist, to_twist, transform
+from mipsjax.images.corners import EDGE_PX, Corners, corners, follow
+from painted import CAMERA, FINE_PX_PER_M, RANGE_M, painting, pose, wall
 
 COUNT, FEWEST = 400, 30
 MOTIONS = [
@@ -117,6 +118,49 @@ def test_a_corner_is_where_it_belongs_when_seen_from_elsewhere(degrees, metres, 
     T_error = T_cam_ref @ found.T_ref_cam
     assert np.linalg.norm(T_error[:3, 3]) < 0.001
     assert np.degrees(Rotation.from_matrix(T_error[:3, :3]).magnitude()) < 0.02
+
+
+def test_no_corner_is_beside_an_edge_of_depth(monkeypatch):
+    """It may be of either side; a plane that is seen at a grazing angle has no edge."""
+    grey, depth = wall(np.eye(4), painting())
+    near = np.arange(CAMERA.width) > 160
+    assert np.abs(from_home(grey, depth).pixel[:, 0] - 160.5).min() < 2
+    found = from_home(grey, np.where(near, depth - 0.5, depth))
+    assert len(found.pixel) > 100 and np.abs(found.pixel[:, 0] - 160.5).min() > EDGE_PX - 2
+    slanted = wall(pose((0, 40, 0), (-1.0, 0, 0)), painting())
+    grazing = from_home(*slanted)
+    assert np.ptp(grazing.p_cam[:, 2]) > 1
+    monkeypatch.setattr("mipsjax.images.corners.EDGE", np.inf)
+    np.testing.assert_array_equal(grazing.pixel, from_home(*slanted).pixel)
+
+
+SLATS = np.tile(np.arange(4 * FINE_PX_PER_M) % 240 < 60, (4 * FINE_PX_PER_M, 1)).astype(np.uint8)
+"""A fence: what is painted on it is seen, and between its slats what is behind."""
+
+
+def behind_a_fence(T_wall_cam: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Brightness and depth of a wall with a fence before it, by a camera that moves on so during its exposure."""
+    images = []
+    for share in np.linspace(-0.5, 0.5, 7):
+        T = T_wall_cam @ from_twist(share * velocity)
+        grey, depth = wall(T, painting())
+        (before, z), slat = wall(T, painting(1), 1.2), wall(T, SLATS, 1.2)[0] > 0
+        images.append((np.where(slat, before, grey), np.where(slat, z, depth)))
+    return np.mean([grey for grey, _ in images], 0).astype(np.uint8), images[3][1]
+
+
+@pytest.mark.parametrize("degrees", [-4.0, 4.0])
+def test_who_turns_and_walks_behind_things_sees_all_of_the_turn(degrees):
+    """Corners between what is behind and the edge of what covers it would move with the latter: too little, where the
+    walk takes back a part of what the turn moves."""
+    truth = pose((0, degrees, 0), (-0.004 * degrees, 0, 0))
+    blur = 0.5 * to_twist(truth)
+    home = from_home(*behind_a_fence(np.eye(4), blur))
+    found = follow(home, behind_a_fence(truth, blur)[0], truth, FEWEST, CAMERA)
+    assert found is not None and len(found.pixel) > 60
+    p_cam = transform(np.linalg.inv(truth), found.p_ref)
+    off = found.pixel[:, 0] - (p_cam[:, 0] / p_cam[:, 2] * CAMERA.fx + CAMERA.cx)
+    assert abs(np.mean(off)) < 0.05
 
 
 def test_a_part_that_moves_by_itself_is_left_out():

@@ -29,6 +29,9 @@ HIDDEN_M, HIDDEN = 0.05, 0.02
 off it is hidden there, or hides that surface."""
 REACH_PX = 2
 """Pixels, about, from which a smoothed gradient is taken along each direction."""
+EDGE_PX, EDGE = 8, 0.1
+"""Pixels on both sides of one within which no edge of depth may be, and the relative change of inverse depth that is
+one."""
 LOST = 3.0
 """Scales of the robust cost by which an error costs most: as much as a point that an image does not show. So no step
 gains by losing sight of it."""
@@ -103,7 +106,8 @@ def _steepest(
     where it is in the image (u, v), the point that it shows, and whether there is one that is steep."""
     every = round(camera.width / depth.shape[1])
     steepness = jnp.sum(texture[::every, ::every, 1:] ** 2, -1)
-    steep = _on_one_surface(depth, -(-REACH_PX // every)) & (steepness > STEEP**2)
+    alone = _on_one_surface(depth, -(-REACH_PX // every)) & ~_beside_an_edge(depth, -(-EDGE_PX // every))
+    steep = alone & (steepness > STEEP**2)
     steepness = jnp.where(steep, steepness, 0)
     (height, width), (rows, columns) = depth.shape, grid_shape(pixels, *depth.shape)
     high, wide = -(-height // rows), -(-width // columns)
@@ -127,6 +131,23 @@ def _on_one_surface(depth: Float[Array, "h w"], reach: int) -> Bool[Array, "h w"
             beside = jax.lax.dynamic_slice(padded, (reach + v, reach + u), depth.shape)
             there &= jnp.abs(beside - depth) < JUMP * depth
     return there
+
+
+def _beside_an_edge(depth: Float[Array, "h w"], reach: int) -> Bool[Array, "h w"]:
+    """Pixels of which two opposite ones, up to so many away, are not in line with them by inverse depth, as those of a
+    plane are.
+
+    A moving camera blurs what is in front over what is behind. Those that were not measured say nothing.
+    """
+    inverse = jnp.where(depth > 0, 1 / jnp.maximum(depth, NEAR), 0)
+    padded, bent = jnp.pad(inverse, reach), jnp.zeros(depth.shape, bool)
+    for off in range(1, reach + 1):
+        for v, u in ((off, 0), (0, off)):
+            before = jax.lax.dynamic_slice(padded, (reach - v, reach - u), depth.shape)
+            after = jax.lax.dynamic_slice(padded, (reach + v, reach + u), depth.shape)
+            bend = jnp.abs(before + after - 2 * inverse)
+            bent |= (before > 0) & (after > 0) & (bend > EDGE * inverse)
+    return bent
 
 
 def grey_of(color: UInt8[Array, "H W 3"]) -> Float[Array, "H W"]:

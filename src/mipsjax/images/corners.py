@@ -29,6 +29,10 @@ DEPTH_WIDTH = 160
 """Pixels, about, of the depth by which an image is drawn from elsewhere: it is kept of every keyframe."""
 MEDIAN_PX = 3
 """Side of the square of that depth of which the median is taken, so that it has no noise; OpenCV knows 3 and 5."""
+EDGE_PX = 12
+"""Pixels around a corner in which no edge of depth may be: half of `WINDOW_PX`, and what a moving camera blurs."""
+EDGE = 0.1
+"""Relative change of inverse depth that is an edge of it."""
 FIRST = 150
 """Corners, the strongest, by which a motion is looked for first; where they do not do, by all."""
 ROUGHLY = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
@@ -102,10 +106,12 @@ def corners(
     surface, z = surface_depth(depth, pixel)
     pixel, z = pixel[surface], z[surface]
     axes, distinct = _axes(grey, pixel)
-    pixel, z, axes = pixel[distinct], z[distinct], axes[distinct]
-    p_cam = unproject(pixel[:, 1], pixel[:, 0], z, camera).astype(np.float32)
     every = _stride(camera)
-    return Corners(record, grey, _filled(depth[::every, ::every]), pixel, p_cam, axes)
+    small = _filled(depth[::every, ::every])
+    wanted = distinct & ~_beside_an_edge(small, pixel, every)
+    pixel, z, axes = pixel[wanted], z[wanted], axes[wanted]
+    p_cam = unproject(pixel[:, 1], pixel[:, 0], z, camera).astype(np.float32)
+    return Corners(record, grey, small, pixel, p_cam, axes)
 
 
 def decimated(camera: Intrinsics) -> Intrinsics:
@@ -132,6 +138,24 @@ def _filled(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     # Labels are of measured pixels: each hole takes the depth of the label that it got
     depth_of[nearest[measured]] = depth[measured]
     return np.asarray(cv2.medianBlur(depth_of[nearest], MEDIAN_PX), np.float32)
+
+
+def _beside_an_edge(
+    depth: Float32[np.ndarray, "h w"], pixel: Float32[np.ndarray, "N 2"], every: int
+) -> Bool[np.ndarray, "N"]:
+    """Whether there is an edge of depth near a pixel: in the square around it the nearest surface is not as much nearer
+    as the farthest one is farther, by inverse depth, which is linear over the image of a plane.
+
+    What is seen there is of both sides, and moves with neither: the surface in front covers and uncovers the other, and
+    a moving camera blurs it over that. Who turns into a room and walks there sees corners on what lies behind move too
+    little, each time.
+    """
+    reach = round(EDGE_PX / every)
+    inverse, square = 1 / depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    nearest, farthest = cv2.dilate(inverse, square), cv2.erode(inverse, square)
+    bent = np.abs(nearest + farthest - 2 * inverse) > EDGE * inverse
+    u, v = np.clip(np.rint(pixel / every).astype(int), 0, np.array(depth.shape[::-1]) - 1).T
+    return np.asarray(bent[v, u])
 
 
 def _axes(
