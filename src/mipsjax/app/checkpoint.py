@@ -70,6 +70,7 @@ class Checkpoints:
         `remarks`."""
         self._folder, self._identity, self._cfg = folder / FOLDER, identity, cfg
         self._remarks = remarks
+        # A single thread writes them in their order, the last one last
         self._pool = ThreadPoolExecutor(1, "checkpoint")
         self._writing: Future[None] | None = None
         self._keyframes, self._began = 0, perf_counter()
@@ -96,6 +97,7 @@ class Checkpoints:
         self._pool.shutdown()
 
     def _remarked(self, progress: Progress) -> Progress:
+        # A copy: the list may grow while the thread writes
         return progress._replace(remarks=tuple(self._remarks))
 
     def _due(self, now: float) -> bool:
@@ -113,6 +115,7 @@ class Checkpoints:
             self._make_folder()
             data = packed(_plain(progress), CONTENT, {**self._identity, "frames": frames})
             write_atomically(self._folder / f"{frames:06d}.npz", data)
+            # Only now that the new one is there whole
             for path in written(self._folder.parent)[KEPT:]:
                 path.unlink(missing_ok=True)
         except Exception as error:  # whatever it is: the run is worth more than its checkpoint
@@ -174,6 +177,7 @@ def remove(folder: Path) -> None:
     with suppress(OSError):
         for path in written(folder):
             path.unlink(missing_ok=True)
+        # Fails, and is to, where anything else lies in it
         (folder / FOLDER).rmdir()
 
 
@@ -234,6 +238,7 @@ def _file(path: Path) -> list[Any]:
 def _code() -> str:
     """A digest of the package's source: a checkout goes on changing while its version stays."""
     root = Path(__file__).parents[1]
+    # In one order: that of a folder is up to the file system
     parts = [
         f"{path.relative_to(root)}\n".encode() + path.read_bytes() for path in sorted(root.rglob("*.py"))
     ]

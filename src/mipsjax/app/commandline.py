@@ -75,6 +75,7 @@ def parse(arguments: list[str]) -> Options:
     """
     names = ["--" + name for name, _ in flat(Config())]
     names += ["--" + item.name for item in fields(Options) if item.name not in ("sequence", "settings")]
+    # Preset and file are read first, since the options go over them
     default = Options(sequence=tyro.MISSING, settings=_base(arguments))
     missing = "no sequence given; pass a folder, or synth:room for a built-in one"
     options = read_options(Options, PROGRAM, arguments, names, missing, default)
@@ -82,6 +83,7 @@ def parse(arguments: list[str]) -> Options:
         loop = replace(options.settings.loop, enabled=False)
         options = replace(options, settings=replace(options.settings, loop=loop))
     validate(options.settings)
+    # For its errors alone: frames are chosen where the sequence is opened
     parse_frames(options.frames)
     return options
 
@@ -100,6 +102,7 @@ def read_options(
     Raises:
         ConfigError: with one line.
     """
+    # What tyro prints of an error fills a screen; a user gets one line of it
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
@@ -210,6 +213,7 @@ def _one_line(arguments: list[str], text: str, names: Iterable[str], missing: st
     known = {name.replace("_", "-") for name in names} | {"--help"}
     for argument in arguments:
         name = argument.split("=", 1)[0].replace("_", "-")
+        # A switch may be turned off by its whole name or by the last part of it: `--loop.no-enabled`
         plain = re.sub(r"(^--|\.)no-", r"\1", name)
         if name.startswith("--") and name not in known and plain not in known:
             return f"unknown option {name}{suggestion(name, sorted(known))}"

@@ -32,6 +32,7 @@ def enable_cache() -> None:
     folder = Path(home) / "mipsjax" / f"xla-{version('jaxlib')}-{_machine()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # A folder that is there may still be one that nobody can write to
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError:

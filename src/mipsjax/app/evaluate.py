@@ -105,6 +105,7 @@ def evaluate(options: Options) -> list[Row]:
         raise ConfigError(f"--points and --delta must be at most {MOST_POINTS}")
     if not 0 <= options.seed <= LARGEST_SEED:
         raise ConfigError(f"--seed must be at least 0 and at most {LARGEST_SEED}, not {options.seed}")
+    # `not >` and not `<=`: a threshold that is NaN is refused as well
     if options.delta < 1 or options.points < 1 or not options.threshold_m > 0 or not options.max_dt >= 0:
         raise ConfigError("--delta, --points and --threshold-m must be positive, --max-dt not negative")
     pair = matched(options.trajectory, options.ground_truth, options.max_dt, options.fps)
@@ -113,6 +114,7 @@ def evaluate(options: Options) -> list[Row]:
     if options.mesh is not None and options.reference is not None:
         moved = options.align_mesh == "trajectory"
         mesh, reference = read_mesh(options.mesh), read_mesh(options.reference)
+        # A mesh is in the world of its own trajectory, so that what aligns the one aligns the other
         mesh.apply_transform(absolute.T_truth_estimate if moved else np.eye(4))
         error = surface.compare_meshes(
             mesh, reference, None, options.threshold_m, options.points, options.seed
@@ -127,6 +129,7 @@ def trajectory_rows(pair: Matched, absolute: AbsoluteError, delta_frames: int) -
     rows = [
         Row("poses_compared", absolute.poses, pair.how),
         Row("poses_unmatched", pair.unmatched, "estimated poses without a true one near in time; left out"),
+        # Unmatched poses have a truth of NaN too, and are counted once
         Row("poses_without_truth", absolute.missing_truth - pair.unmatched, "true pose not finite; left out"),
         Row("poses_without_estimate", absolute.missing_estimate, "estimate not finite; left out"),
         Row("ate_rmse_m", absolute.rmse_m, ate),
@@ -181,6 +184,7 @@ def matched(trajectory: Path, ground_truth: Path, max_dt: float, fps: float | No
         return Matched(estimate.poses, truth.poses, "row by row, since a file has no timestamps", 0)
     first, second = associate(estimate.timestamps, truth.timestamps, max_dt)
     near = np.full_like(estimate.poses, np.nan)
+    # One row an estimated pose, matched or not: RPE takes rows for neighbours
     near[first] = truth.poses[second]
     how = f"nearest in time, at most {max_dt:g} s apart"
     return Matched(estimate.poses, near, how, len(estimate.poses) - len(first))

@@ -181,6 +181,7 @@ def claimed(folder: Path) -> Iterator[Callable[[], bool]]:
     try:
         yield lambda: _same_file(lock, folder / LOCK)
     finally:
+        # While it is still held: once it is free, a file of this name may be another run's
         if _same_file(lock, folder / LOCK):
             (folder / LOCK).unlink(missing_ok=True)
         os.close(lock)
@@ -300,6 +301,7 @@ def events_jsonl(run: Run, notes: Iterable[str]) -> str:
             events.append({"event": f"found {row.info.found}", **where, "submap": row.info.submap})
         if last is Status.LOST and row.status in (Status.OK, Status.WEAK):
             events.append({"event": "recovered", **where})
+        # Whether the camera is lost is not known of a skipped frame
         last = last if row.status is Status.SKIPPED else row.status
     events += [{"event": "warning", "text": note} for note in notes]
     events.append({"event": "end", "how": run.end, "status": verdict(run.rows, run.agreement)})

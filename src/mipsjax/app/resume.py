@@ -36,6 +36,7 @@ def resumed_options(arguments: list[str]) -> Options | None:
     except argparse.ArgumentError as error:
         if error.argument_name == "--resume":
             raise ConfigError("--resume takes the folder of a run") from error
+        # What else is wrong is said where the whole command line is read
         return None
     if given.resume is None or "--help" in others:
         return None
@@ -54,6 +55,7 @@ def options_in(folder: Path) -> Options:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         plain = dict(content["options"], sequence=content["sequence"]["source"], resume=folder, inspect=False)
+        # Over the default, whatever the preset was: all fields are in it
         cfg = merged(Config(), content["config"])
         validate(cfg)
         known = {item.name for item in fields(Options)} - {"settings"}
@@ -90,11 +92,12 @@ def progress_in(folder: Path, identity: dict[str, Any]) -> Progress:
             found = identity_in(path)
             _check(path, found, identity)
             progress = read(path)
-        except _OtherRunError:
+        except _OtherRunError:  # it is whole, and an older one would be of that run too
             raise
         except InputError as error:
             damaged.append((path, error))
             continue
+        # Only now that there is one to go on with: where all are damaged, all stay
         for other, error in damaged:
             log.warning("%s; the run goes on after frame %d", error, found["frames"])
             with suppress(OSError):

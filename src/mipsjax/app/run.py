@@ -69,6 +69,7 @@ def travel(
         return Progress(state, tuple(waited), tuple(infos), tuple(read_s), tuple(step_s), bad)
 
     with executor(cfg.background.executor) as beside:
+        # Each frame that was read, whatever came of it, has its time in the list
         for position in range(len(read_s), len(sequence)):
             if stop() or bad > cfg.input.max_bad_frames:
                 break
@@ -91,6 +92,7 @@ def travel(
                 infos[-1] = infos[-1]._replace(checkpoint_ms=waited_ms)
             tell(status)
         interrupted = len(read_s) < len(sequence) and bad <= cfg.input.max_bad_frames
+        # Before `finish`, which ends the map: what is resumed goes on with the next frame
         if interrupted and state is not None:
             kept.last(progress())
         began = perf_counter()
@@ -156,6 +158,7 @@ def _run(options: Options) -> int:
         seconds = {"open": opened_s, "judge": judged_s}
         meshing = "none" if options.no_mesh else "unfinished"
         content = outputs.write_results(folder, run, None, seconds, remarks, meshing)
+        # A signal that came after the last frame ends the program before the mesh
         late = stop() and run.end == "done"
         if not options.no_mesh:
             began = perf_counter()
@@ -202,6 +205,7 @@ def _exit_code(run: Run, folder: Path) -> int:
         )
     if len(rows) - len(bad) < MIN_USABLE:
         raise InputError(f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}")
+    # Depth images that contradict each other degrade a run, and fail none
     if verdict(rows) == "failed":
         lost = [row.number for row in rows if row.status is Status.LOST]
         raise TrackingLostError(

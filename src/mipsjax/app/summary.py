@@ -90,6 +90,7 @@ class Run(NamedTuple):
         """Ground truth of the processed frames."""
         if self.sequence.T_world_cam is None or self.state is None:
             return None
+        # Frames before the first usable one have no record
         first = len(self.waited)
         return self.sequence.T_world_cam[first : first + len(self.state.records)]
 
@@ -147,6 +148,7 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
         **seconds,
         "evaluate": perf_counter() - began,
     }
+    # Before those are added that are parts of `frames`
     total = sum(stages.values())
     stages["track"] = sum(row.info.track_ms for row in rows) / 1e3
     stages["map"] = sum(row.info.map_ms for row in rows) / 1e3
@@ -317,4 +319,4 @@ def _peak_memory() -> int | None:
     if resource is None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if platform.system() == "Darwin" else 1024 * peak
+    return peak if platform.system() == "Darwin" else 1024 * peak  # bytes on macOS, kilobytes on Linux

@@ -70,9 +70,11 @@ RANGES: dict[str, Range] = {
     "input.depth_max": POSITIVE,
     "input.working_width": Range(SMALLEST_IMAGE),
     "input.max_bad_frames": NOT_NEGATIVE,
+    # Precisions are relative to this one: they are divided by it
     "sensor.noise_floor": POSITIVE,
     "sensor.noise_growth": NOT_NEGATIVE,
     "field.truncation": POSITIVE,
+    # Distances of classes are 2 truncation / (classes - 1) apart
     "field.classes": Range(2, 64),
     "field.coldness": POSITIVE,
     # Rounding of the angle loses a bit an octave: single precision has 24
@@ -87,6 +89,7 @@ RANGES: dict[str, Range] = {
     "field.hash_hidden": LAYER,
     "field.color_hidden": LAYER,
     "sample.uniform": Range(0, MOST_SAMPLES),
+    # Colour is rendered on these: one at least
     "sample.truncation": SAMPLES,
     "sample.surface": Range(0, MOST_SAMPLES),
     "sample.surface_spread": POSITIVE,
@@ -103,19 +106,24 @@ RANGES: dict[str, Range] = {
     "map.revisit_steps": NOT_NEGATIVE,
     "map.final_steps": NOT_NEGATIVE,
     "map.motion": POSITIVE,
+    # The first map must know something before the second frame; later ones may do without (No SI)
     "map.first_steps": COUNT,
+    # The current frame, the anchor, and a random one
     "map.frames": Range(3),
     "map.pixels": SAMPLES,
     "map.learning_rate": POSITIVE,
+    # Adam divides by 1 less a power of it
     "map.momentum": Range(0.0, 0.999),
     "map.pose_learning_rate": NOT_NEGATIVE,
     "map.pose_rate_slow": SHARE,
     "map.width_px": Range(SMALLEST_IMAGE),
+    # Particle 0 is the centre of the swarm: alone it would find nothing
     "track.ro.particles": Range(2, MOST_SAMPLES),
     "track.ro.pixels": SAMPLES,
     "track.ro.steps": COUNT,
     "track.ro.rotation": POSITIVE,
     "track.ro.translation": POSITIVE,
+    # Below 1 the search would narrow while the camera is lost
     "track.ro.widening": Range(1.0),
     "track.ro.widening_limit": Range(1.0),
     "track.ro.momentum": SHARE,
@@ -141,6 +149,7 @@ RANGES: dict[str, Range] = {
     "track.go.view_rotation": NOT_NEGATIVE,
     "track.corners.count": Range(0, MOST_SAMPLES),
     "track.corners.keyframes": NOT_NEGATIVE,
+    # RANSAC draws a motion from four of them
     "track.corners.fewest": Range(4),
     "track.corners.noise_px": POSITIVE,
     "track.corners.robust": POSITIVE,
@@ -150,6 +159,7 @@ RANGES: dict[str, Range] = {
     "track.brightness.noise": POSITIVE,
     "track.brightness.robust": POSITIVE,
     "track.brightness.coarse_steps": NOT_NEGATIVE,
+    # Information is divided by these: so many that err together count as one
     "track.held.points": POSITIVE,
     "track.held.corners": POSITIVE,
     "track.held.brightness": POSITIVE,
@@ -163,12 +173,14 @@ RANGES: dict[str, Range] = {
     "keyframe.error": POSITIVE,
     "keyframe.known": SHARE,
     "keyframe.every_frames": COUNT,
+    # Infinite: no keyframe by motion, as in the paper
     "keyframe.translation": SWITCH,
     "keyframe.rotation": SWITCH,
     "guard.weak": SHARE,
     "guard.lost": SHARE,
     "guard.confirmed": SHARE,
     "guard.measured": SHARE,
+    # Infinite: no frame is lost by its residual
     "guard.residual": SWITCH,
     "guard.residual_unsure": SWITCH,
     "guard.residual_lost": SWITCH,
@@ -193,6 +205,7 @@ RANGES: dict[str, Range] = {
     "loop.held": NOT_NEGATIVE,
     "loop.drift": POSITIVE,
     "loop.drift_rotation": POSITIVE,
+    # A measurement with a deviation of 0 would outweigh all others in the pose graph
     "loop.sigma": POSITIVE,
     "loop.sigma_rotation": POSITIVE,
     "loop.fewest_points": COUNT,
@@ -229,11 +242,15 @@ RANGES: dict[str, Range] = {
 NOT_BELOW = (
     ("input.depth_max", "input.depth_min"),
     ("field.hash_coarsest", "field.hash_finest"),
+    # A band beyond the truncation has the jump behind a surface in it, which would be meshed
     ("field.truncation", "mesh.band"),
+    # What is lost must be weak as well
     ("guard.weak", "guard.lost"),
+    # The less certain it is where the camera is, the less a frame may be off
     ("guard.residual", "guard.residual_unsure"),
     ("guard.residual_unsure", "guard.residual_lost"),
     ("correspond.max_gradient", "correspond.min_gradient"),
+    # A direction that makes a frame weak must follow the motion before, too
     ("track.held.weak", "track.held.loose"),
 )
 """Pairs whose first field must not be below the second."""
@@ -244,11 +261,13 @@ def validate(cfg: Config) -> None:
     values = dict(flat(cfg))
     for name, value in values.items():
         if name in RANGES:
+            # A field with several numbers has the widths of layers
             numbers = value if isinstance(value, tuple) else (value,)
             if len(numbers) > MOST_LAYERS:
                 raise ConfigError(f"{name} may have {MOST_LAYERS} layers, got {len(numbers)}")
             for number in numbers:
                 _check_number(name, number)
+    # Each factor may be in its range and the product beyond any memory
     grid = cfg.field.hash_levels * 2**cfg.field.hash_log2_entries * cfg.field.hash_features
     if grid > LARGEST_TABLE:
         raise ConfigError(
@@ -267,9 +286,11 @@ def _check_number(name: str, number: float) -> None:
     allowed = RANGES[name]
     # First, since an integer may be too large even to be compared with infinity
     if isinstance(number, int):
+        # Seeds go up to 32 bits without a sign: they are drawn from, not counted with
         most = LARGEST_COUNT if allowed.high == math.inf else max(LARGEST_COUNT, int(allowed.high))
         if abs(number) > most:
             raise ConfigError(f"{name} must be at most {most}, got {_shown(number)}")
+    # 0 and infinity switch things off: the range says whether they may
     elif math.isfinite(number) and number > 0 and not SMALLEST_NUMBER <= number <= LARGEST_NUMBER:
         raise ConfigError(
             f"{name} must be between {SMALLEST_NUMBER:g} and {LARGEST_NUMBER:g}, got {number:g}"
@@ -345,9 +366,11 @@ def read_toml(path: Path, base: Config) -> Config:
 
 def _read_small(path: Path) -> bytes:
     """The bytes of a file that can be a config. Raises ConfigError for a pipe, a device or anything huge."""
+    # Opening a pipe would wait for somebody to write into it
     if path.exists() and not path.is_file():
         raise ConfigError(f"--config {path}: is no regular file; name a TOML file")
     with path.open("rb") as file:
+        # One byte more, which tells a larger file from one of just that size
         data = file.read(LARGEST_FILE_BYTES + 1)
     if len(data) > LARGEST_FILE_BYTES:
         raise ConfigError(
@@ -368,6 +391,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 def _known_names() -> list[str]:
     """Dotted names of all fields and sections."""
     leaves = [name for name, _ in flat(Config())]
+    # Sections are two deep at most, as `track.ro`
     sections = {name.rsplit(".", depth)[0] for name in leaves for depth in (1, 2) if "." in name}
     return leaves + sorted(sections - set(leaves))
 
@@ -390,9 +414,11 @@ def _typed(name: str, value: Any, wanted: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise ConfigError(f"{name} must be a list, got {_shown(value)}")
         return tuple(_typed(name, item, get_args(wanted)[0]) for item in value)
+    # As `to_dict` writes what JSON has no number for
     if wanted is float and value in ("inf", "-inf", "nan"):
         return float(value)
     allowed = (int, float) if wanted is float else (wanted,)
+    # In Python true is a whole number
     if not isinstance(value, allowed) or (isinstance(value, bool) and wanted is not bool):
         raise ConfigError(f"{name} must be {_TYPE_NAMES[wanted]}, got {_shown(value)}")
     try:

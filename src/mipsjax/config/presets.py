@@ -40,10 +40,13 @@ is certain of nothing."""
 
 PAPER = Config(
     sensor=SensorConfig(noise_growth=0.0),
+    # The two softmaxes in a row saturate: kept, since they are the paper's (docs/method.md, b)
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
+    # All 20 + 20 + 10 samples of a ray carry colour
     loss=LossConfig(cross_entropy=0.0, cross_entropy_free=0.0, color_samples=50),
     map=MapConfig(
+        # In one place of the paper; 10 in another. Effort and rate of poses do not follow the motion
         steps=15,
         steps_slow=15,
         pose_rate_slow=1.0,
@@ -51,21 +54,26 @@ PAPER = Config(
         submap_steps=500,
         final_steps=0,
         pixels=384,
+        # Not given there: the usual one
         momentum=0.9,
         pose_learning_rate=1e-3,
     ),
     track=TrackConfig(
         ro=SearchConfig(when="always", particles=2048, pixels=384, steps=10, epsilon=1e-3),
+        # Depth and colour are compared with the map alone, never with keyframes
         go=RefineConfig(
             method="adam", pixels=384, steps=10, final_steps=0, uncertainty=False, views=0, known=0
         ),
+        # The colour term of Adam (Eq. 17) is in the place of both
         corners=CornerConfig(count=0),
         brightness=BrightnessConfig(weight=0.0),
+        # How far a pose may be off is still stated; nothing follows from it
         held=HeldConfig(loose=UNLIMITED, weak=UNLIMITED, unsure=UNLIMITED),
     ),
     guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
+    # The nearest to a second process that refines all the time
     background=BackgroundConfig(every_frames=1, rate=1.0, pose_rate=1.0),
     loop=LoopConfig(relocalise=False),
     pairs=PairConfig(before=0, others=0, oldest=0),
@@ -74,6 +82,7 @@ TINY = Config(
     field=FieldConfig(
         hidden=(16,), hash_levels=4, hash_log2_entries=12, hash_hidden=(16,), color_hidden=(16,)
     ),
+    # Its images are too coarse for normals
     sample=SampleConfig(uniform=4, truncation=6, perpendicular=False),
     loss=LossConfig(cross_entropy_free=3.0),
     map=MapConfig(

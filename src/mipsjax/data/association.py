@@ -46,6 +46,7 @@ def associate(
     left, right = np.arange(len(first)), np.arange(len(second))
     chosen_left, chosen_right = [], []
     while len(left) and len(right):
+        # Who is nearest to each other is a pair; once they are gone others are nearest to each other
         there = nearest(second[right], first[left])
         back = nearest(first[left], second[right])
         mutual = back[there] == np.arange(len(left))
@@ -78,6 +79,7 @@ def poses_at(
     """
     order, _ = sort_stamps(trajectory.timestamps, "trajectory")
     stamps, poses = trajectory.timestamps[order], trajectory.T_world_cam[order]
+    # Unknown ones are left out first, so that what lies between known ones counts as a gap
     known = known_poses(poses)
     stamps, poses = stamps[known], poses[known]
     if not len(stamps):
@@ -101,6 +103,7 @@ def _interpolate(
     before = after - 1
     gap = stamps[after] - stamps[before]
     inside = (timestamps >= stamps[before]) & (timestamps <= stamps[after]) & (gap <= max_gap)
+    # 0 where the pose becomes NaN below: no turn is extrapolated
     weight = np.where(inside, (timestamps - stamps[before]) / gap, 0.0)
     start = Rotation.from_matrix(poses[before, :3, :3])
     turn = (start.inv() * Rotation.from_matrix(poses[after, :3, :3])).as_rotvec()

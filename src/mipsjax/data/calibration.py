@@ -159,6 +159,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def json_number(content: dict[str, Any], name: str, path: Path) -> float:
     """One finite number. Raises InputError naming file and value."""
     value = content.get(name)
+    # In Python true is a number
     if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
         raise InputError(f"{path}: {name} must be a number, got {value!r}")
     return float(value)
@@ -208,6 +209,7 @@ def resolve_intrinsics(
             f"{_text(depth_size)}: pass --intrinsics FX FY CX CY for the depth images"
         )
     intrinsics = Intrinsics(given.fx, given.fy, given.cx, given.cy, *size)
+    # At the size they were written for, with the numbers that the user knows
     remarks += check_intrinsics(intrinsics, given)
     if size != depth_size:
         remarks.append(f"intrinsics of {given.source} rescaled from {_text(size)} to {_text(depth_size)}")
@@ -225,6 +227,7 @@ def check_intrinsics(intrinsics: Intrinsics, given: Calibration) -> list[str]:
     values = f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} for {width} x {height}, from {given.source}"
     if not all(math.isfinite(value) for value in (fx, fy, cx, cy)) or fx == 0 or fy == 0:
         raise InputError(f"unusable intrinsics: {values}")
+    # Centres of pixels are at whole numbers: the image reaches half a pixel farther
     if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         raise InputError(f"the principal point is outside the image: {values}; the order is FX FY CX CY")
     ratios = abs(fx) / width, abs(fy) / height

@@ -37,6 +37,7 @@ def checked_start(
     Raises:
         InputError: one of them is not what it should be.
     """
+    # First, since images are held against its size
     camera = checked_camera(camera)
     frame = checked_frame(frame, camera)
     if frame.color is None or frame.depth is None:
@@ -107,6 +108,7 @@ def checked_pose(T_world_cam: Any) -> Float64[np.ndarray, "4 4"]:
         raise InputError("a pose must be finite; leave it out where it is not known")
     rotation = pose[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    # A transposed pose has its translation in the last row
     if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], _BOTTOM_ROW):
         raise InputError(
             "a pose must be a rotation, not mirrored, and a translation over 0 0 0 1: the rotation is off by "

@@ -60,6 +60,7 @@ class SeqFile:
     def raw_depth(self, position: int) -> tuple[UInt16[np.ndarray, "H W"] | None, str]:
         """Depth in millimetres."""
         depth, problem = self._pixels(position, _DEPTH, "depth")
+        # In the byte order of the machine, whatever that of the file
         return (None, problem) if depth is None else (depth.astype(np.uint16), "")
 
     def color_header(self, position: int) -> ImageHeader | None:
@@ -105,6 +106,7 @@ def matches(path: Path) -> bool:
     root = find_root(path)
     if root is None or not has_png_color(root):
         return False
+    # With intrinsics it is ScanNet, which has the same folders
     return not any((folder / "intrinsic").is_dir() for folder in (path, root))
 
 
@@ -129,6 +131,7 @@ def open_seq(path: Path) -> tuple[SeqFile, tuple[str, ...]]:
         raise InputError(f"{path}: not a .seq file (frames {count}, height {height}, width {width})")
     if height * width > MOST_PIXELS:
         raise InputError(f"{path}: images of {width} x {height} pixels, at most {MOST_PIXELS} are read")
+    # A recording that was cut short is read as far as it goes
     whole = min(count, (size - _OFFSET) // _record(height, width).itemsize)
     if whole < 1:
         raise InputError(f"{path}: {count} frames announced, not one is complete")

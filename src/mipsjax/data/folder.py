@@ -28,6 +28,7 @@ MARKERS = f"color/, depth/, {CAMERA_FILE}"
 
 def matches(path: Path) -> bool:
     """Whether a folder looks like this layout."""
+    # With `pose/` it is ScanNet or FastCaMo
     return (path / "color").is_dir() and (path / "depth").is_dir() and not (path / "pose").is_dir()
 
 

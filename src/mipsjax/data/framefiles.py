@@ -95,6 +95,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of a folder with one of the suffixes in any case, hidden ones left out; empty if no folder."""
     if not folder.is_dir():
         return []
+    # Hidden ones are of the system, as macOS leaves `._1.png` beside `1.png`
     files = (path for path in folder.iterdir() if not path.name.startswith("."))
     return sorted(path for path in files if path.suffix.lower() in suffixes)
 
@@ -156,6 +157,7 @@ def rows_for_frames(
         return rows, ()
     numbers = frame_numbers(keys) or list(range(len(keys)))
     poses = np.full((len(keys), 4, 4), np.nan)
+    # Lists of truth have a row for each frame of the recording, those that were left out among them
     found = [(place, number) for place, number in enumerate(numbers) if number < len(rows)]
     if found:
         places, row_numbers = zip(*found, strict=True)

@@ -38,6 +38,7 @@ _PNG_AROUND = 12
 _JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _JPEG_START_OF_SCAN = 0xDA
+# Among the starts of frames, C4, C8 and CC mark tables and extensions, which have no size
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -172,6 +173,7 @@ def _pixels_only(data: bytes) -> bytes:
 def _png_header(data: bytes) -> ImageHeader | None:
     if len(data) < 26 or data[12:16] != b"IHDR":
         return None
+    # The first chunk: length, `IHDR`, then its content
     width, height, bits, color_type = struct.unpack(">IIBB", data[16:26])
     return ImageHeader(width, height, bits, _PNG_CHANNELS.get(color_type, 0))
 
@@ -185,6 +187,7 @@ def _png_damage(data: bytes) -> str:
         if body_end + 4 > end:
             break
         (checksum,) = struct.unpack(">I", data[body_end : body_end + 4])
+        # Of a chunk's name and content, not of its length
         if zlib.crc32(data[at + 4 : body_end]) != checksum:
             return "damaged PNG (checksum)"
         if data[at + 4 : at + 8] == b"IEND":
@@ -201,6 +204,7 @@ def _jpeg_layout(data: bytes) -> tuple[ImageHeader | None, int]:
         if marker == 0xFF:  # fill byte
             at += 1
             continue
+        # With its own two bytes, without those of the marker
         (length,) = struct.unpack(">H", data[at + 2 : at + 4])
         if marker == _JPEG_START_OF_SCAN:
             return header, at + 2 + length

@@ -128,6 +128,7 @@ class ImageSequence:
         try:
             depth, problem = self.source.raw_depth(place)
         except InputError as error:
+            # A single frame of another type is a bad frame; where most are, opening was refused
             return None, f"unreadable_depth: {error}"
         if depth is None:
             return None, problem
@@ -170,6 +171,7 @@ def image_sequence(
         notes=notes + order_notes + size_notes + intrinsics_notes + view_notes,
         source=source,
         positions=order,
+        # Counted in the order of time, before any selection
         numbers=np.arange(len(order)),
         shape=Shape(color_size, depth_size, undistortion_maps(native, calibration.distortion), every_px),
         calibration=calibration,
@@ -192,7 +194,9 @@ def undistortion_maps(intrinsics: Intrinsics, distortion: tuple[float, ...]) -> 
 
 def shape_color(color: UInt8[np.ndarray, "H W 3"], shape: Shape) -> UInt8[np.ndarray, "h w 3"]:
     """Resampled to the depth size, undistorted, decimated; consistent with the intrinsics to sub-pixels."""
+    # First, since maps and decimation are for the size of the depth
     if shape.color_size != shape.depth_size:
+        # Means of areas where it shrinks, against aliasing
         shrinks = shape.depth_size[0] < shape.color_size[0]
         color = cv2.resize(
             color, shape.depth_size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

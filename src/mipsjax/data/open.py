@@ -204,11 +204,13 @@ def _require_path(path: Path) -> Path:
             existing = next(parent for parent in path.absolute().parents if parent.exists())
             raise InputError(f"{path}: does not exist; the nearest folder that does is {existing}")
         if path.is_dir():
+            # A folder that may not be read fails here, and not within a reader
             next(path.iterdir(), None)
         elif not fastcamo.matches(path):
             raise InputError(f"{path}: is a file, a folder is expected")
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror or error})") from error
+    # Links are not followed: the name of one may say which camera it was
     return Path(os.path.abspath(path))
 
 

@@ -92,6 +92,7 @@ def _camera_params(path: Path, options: Options) -> tuple[Calibration, DepthScal
         missing = " and ".join(name for name, known in wanted.items() if known is None)
         return PUBLISHED, DEPTH_SCALE, (f"no {_CAMERA_FILE}: {missing} of {PUBLISHED.source} assumed",)
     content = read_json(file)
+    # In a section of its own as published, or at the top
     camera = content.get("camera", content)
     if not isinstance(camera, dict):
         raise InputError(f"{file}: 'camera' must hold the values w, h, fx, fy, cx, cy, scale")

@@ -48,6 +48,7 @@ def has_png_color(root: Path) -> bool:
 def matches(path: Path) -> bool:
     """Whether a folder looks like this layout."""
     root = find_root(path)
+    # Without intrinsics, PNG colour is FastCaMo-Synth's, which has the same folders
     return root is not None and (_intrinsic_folder(path) is not None or not has_png_color(root))
 
 
@@ -69,6 +70,7 @@ def read_frames(
         list_files(root / "color", COLOR_SUFFIXES), list_files(root / "depth", DEPTH_SUFFIXES), _stem
     )
     require_images(files, root, "depth/*.png")
+    # Poses have the number of whichever image there is
     stems = [(depth or color) for depth, color in zip(files.depth_paths, files.color_paths, strict=True)]
     poses, pose_notes = read_matrix_files(
         [root / "pose" / f"{stem.stem}.txt" if stem else None for stem in stems], "pose/"

@@ -103,6 +103,7 @@ def _sequences_in(path: Path) -> list[Path]:
 
 
 def _frame_name(path: Path) -> str:
+    # Without `.color.png` and the like: `Path.stem` takes the last ending only
     return path.name.split(".", 1)[0]
 
 

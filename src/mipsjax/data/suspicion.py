@@ -103,6 +103,7 @@ def suspicions_of_truth(
         "world-to-camera poses, which are to be inverted": np.linalg.inv(truth),
         "poses in OpenGL axes (y up, z backward), whose second and third column are to be negated": truth
         * OPENGL,
+        # What was read as x y z w is w x y z then
         "quaternions with w first, which are to be written x y z w": _with_rotations(
             truth, xyzw[:, [1, 2, 3, 0]]
         ),
@@ -119,6 +120,7 @@ def suspicions_of_truth(
 
 def _turned_apart_deg(first: Float64[np.ndarray, "N 4 4"], second: Float64[np.ndarray, "N 4 4"]) -> float:
     """Median angle between the turns of two trajectories, each over a part of its length."""
+    # Turns, not poses: whatever lies between the two worlds cancels
     apart = max(1, len(first) // TURNS)
     turns = [
         Rotation.from_matrix(poses[:-apart, :3, :3]).inv() * Rotation.from_matrix(poses[apart:, :3, :3])
@@ -144,4 +146,5 @@ def _smoother_swapped(raw: np.ndarray) -> bool:
     def roughness(image: np.ndarray) -> float:
         return float(np.median(np.abs(np.diff(image.astype(np.int64), axis=1))[both]))
 
+    # One unit more: an even image has no roughness to divide by
     return roughness(raw) > SMOOTHER * (roughness(raw.byteswap()) + 1)

@@ -17,6 +17,7 @@ LARGEST_TEXT_BYTES = 1 << 28
 def read_text(path: Path) -> str:
     """The whole file as text; bytes that are not UTF-8 are replaced. Raises InputError if unreadable."""
     try:
+        # `-sig`: editors on Windows begin a file with a mark of its byte order
         text = read_regular(path, LARGEST_TEXT_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error

@@ -75,6 +75,7 @@ def project_rotations(rotations: Float64[np.ndarray, "N 3 3"]) -> Float64[np.nda
     """
     with np.errstate(invalid="ignore"):
         usable = np.all(np.abs(rotations) <= _LARGEST_ENTRY, axis=(-2, -1))
+    # Of what is not finite there is no decomposition: the identity stands in, and is no result
     left, stretch, right = np.linalg.svd(np.where(usable[:, None, None], rotations, np.eye(3)))
     nearest = left @ right
     good = usable & (np.abs(stretch - 1).max(axis=-1) <= MAX_STRETCH) & (np.linalg.det(nearest) > 0)
@@ -95,6 +96,7 @@ def clean_poses(
         skew = np.abs(matrices[:, 3] - np.array(_BOTTOM_ROW)) > _BOTTOM_ROW_TOLERANCE
         near = np.abs(matrices[:, :3, 3]).max(axis=-1) <= FARTHEST_M
     rigid = finite & known_poses(poses) & ~skew.any(axis=-1) & near
+    # It was right up to a tolerance: exact from here on
     poses[:, 3] = _BOTTOM_ROW
     poses[~rigid] = np.nan
     return poses, _remarks(finite, rigid, source)
@@ -172,6 +174,7 @@ def _of_tum_rows(rows: Float64[np.ndarray, "N 8"]) -> Trajectory:
     timestamps = rows[:, 0]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = rows[:, 1:4]
+    # A file has x y z w, memory w x y z
     poses[:, :3, :3] = matrix_from_quaternion(rows[:, [7, 4, 5, 6]])
     with np.errstate(invalid="ignore"):
         near = np.abs(rows[:, 1:4]).max(axis=-1, initial=0.0) <= FARTHEST_M

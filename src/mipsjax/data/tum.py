@@ -66,6 +66,7 @@ def read(path: Path, options: Options) -> ImageSequence:
     """Opens a folder. Raises InputError."""
     options = with_camera_file(options, path)
     associations = _first_file(path, _ASSOCIATIONS)
+    # Pairs that somebody has chosen go before those that are nearest in time
     listing = read_associations(associations) if associations else read_lists(path)
     calibration, camera_notes = _calibration(path, options)
     truth = _first_file(path, _GROUND_TRUTH)
@@ -97,6 +98,7 @@ def read_lists(path: Path) -> Listing:
         counts = f"{len(rgb_files)} colour and {len(depth_files)} depth images"
         notes += (f"{len(depth)} pairs of {counts}; the others have no partner in time",)
     files = ImageFiles(tuple(rgb_files[i] for i in rgb), tuple(depth_files[i] for i in depth))
+    # A frame is of the moment of its depth, which the map is made of
     return Listing(depth_times[depth], files, notes)
 
 

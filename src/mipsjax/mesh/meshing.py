@@ -111,6 +111,7 @@ def extract(
         raise ValueError(f"voxel size and margin must be positive, not {voxel_m} and {margin_m}")
     limits = (np.inf if band_m is None else band_m / voxel_m, np.inf if max_entropy is None else max_entropy)
     store = _evaluate(query, _voxelised(observed_points, voxel_m), voxel_m, margin_m / voxel_m, limits[1])
+    # In one order, so that the same map gives the same bytes
     pieces = [_mesh_tile(store, tile, limits[0]) for tile in sorted(_meshed_tiles(store))]
     vertices, faces = _merged([piece for piece in pieces if piece is not None])
     vertices = (vertices * voxel_m).astype(np.float32)
@@ -158,6 +159,7 @@ def _voxelised(points: Float[np.ndarray, "N 3"], voxel_m: float) -> Int[np.ndarr
     """Distinct lattice vertices nearest to the finite points, in the order of tiles."""
     finite = np.asarray(points)[np.isfinite(points).all(axis=1)].astype(np.float64)
     nearest = np.rint(finite / voxel_m)
+    # Less a tile: vertices and cells around the points need coordinates, too
     if len(nearest) and np.abs(nearest).max() >= LATTICE_LIMIT - TILE:
         raise ValueError(
             f"observed points reach {np.abs(finite).max():g} m: too far for a voxel of {voxel_m:g} m"
@@ -209,6 +211,7 @@ def _active_vertices(
     for tile in _tiles_within(occupied, halo):
         near = _neighbourhood(by_tile, tile, halo)
         if near.any():
+            # The nearest occupied vertex may be a neighbouring tile's, hence the halo
             distance = np.asarray(distance_transform_edt(~near))
             own = (slice(halo, halo + TILE),) * 3
             vertex = np.flatnonzero(distance[own] <= margin).astype(np.uint16)
@@ -288,6 +291,7 @@ def _mesh_tile(store: dict[_Tile, _Samples], tile: _Tile, band: float) -> _Piece
     # the mask entry of a cell is that of its far corner
     mask = np.zeros(volume.shape, bool)
     mask[1:, 1:, 1:] = cell
+    # Marching cubes takes no NaN; the mask keeps cells with an unknown corner out
     filled = np.clip(np.where(known, volume, 1.0), -CLIP, CLIP).astype(np.float32)
     position, faces, _, _ = marching_cubes(filled, 0.0, mask=mask)
     lattice = position.astype(np.float64) + np.array(tile) * TILE
@@ -340,6 +344,7 @@ def _without_small(
     count = len(vertices)
     if count == 0:
         return vertices, faces
+    # Two of its three edges join the corners of a triangle
     links = (np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel()))
     _, label = connected_components(coo_matrix(links, shape=(count, count)), directed=False)
     corners = vertices[faces].astype(np.float64)
@@ -350,6 +355,7 @@ def _without_small(
     faces = faces[large[label[faces[:, 0]]]]
     used = np.zeros(count, bool)
     used[faces] = True
+    # The new number of a vertex is how many of the used ones come before it
     return vertices[used], (np.cumsum(used) - 1)[faces]
 
 
@@ -364,6 +370,7 @@ def _finished(
         uncertainty = np.concatenate([np.asarray(query(part)[1], np.float32) for part in parts])
     if parts and color is not None:
         colors = np.concatenate([_as_uint8(np.asarray(color(part))) for part in parts])
+    # Not processed: trimesh would merge and reorder vertices, away from their attributes
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     mesh.vertex_attributes["uncertainty"] = uncertainty
     return mesh

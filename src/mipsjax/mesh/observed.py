@@ -30,6 +30,7 @@ class Observed(NamedTuple):
 
 def observe(points: Float[np.ndarray, "N 3"], trust: Float[np.ndarray, " N"], cell_m: float) -> Observed:
     """From measured points and how far each is trusted (0..1): a cell counts as its best point."""
+    # Best first, since `np.unique` gives the first of each cell
     best = np.argsort(-trust, kind="stable")
     cells = np.floor(points[best] / cell_m).astype(np.int64)
     _, first = np.unique(_packed(cells), return_index=True)
@@ -37,6 +38,7 @@ def observe(points: Float[np.ndarray, "N 3"], trust: Float[np.ndarray, " N"], ce
     corners, place = np.unique(_packed(touched), return_inverse=True)
     total = np.bincount(place.ravel(), np.repeat(trust[best][first], len(CORNERS)), len(corners))
     lo, hi = (touched.min(0) - 1, touched.max(0) + 1) if len(touched) else np.zeros((2, 3))
+    # By all eight cells, measured or not: so trust falls towards the end of what was measured
     mean = (total / len(CORNERS)).astype(np.float32)
     return Observed(cell_m, corners, mean, cell_m * lo, cell_m * hi)
 
@@ -56,6 +58,7 @@ def trust_at(observed: Observed, points: Float[np.ndarray, "N 3"]) -> Float32[np
     share = (scaled - cells).astype(np.float32)
     for corner in CORNERS:
         key = _packed(cells + corner)
+        # A key behind the last one gets the last place, where the comparison below fails
         place = np.minimum(np.searchsorted(observed.corners, key), len(observed.corners) - 1)
         weight = np.where(corner, share, 1 - share).prod(1)
         out[near] += np.where(observed.corners[place] == key, weight * observed.trust[place], 0)
@@ -63,5 +66,6 @@ def trust_at(observed: Observed, points: Float[np.ndarray, "N 3"]) -> Float32[np
 
 
 def _packed(coordinates: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    # Made positive, so that no sign reaches into the bits of the next axis
     x, y, z = (coordinates + (1 << (BITS - 1))).T
     return (x << (2 * BITS)) | (y << BITS) | z

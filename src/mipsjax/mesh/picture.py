@@ -50,9 +50,11 @@ def level(mesh: trimesh.Trimesh, up: Float64[np.ndarray, "3"]) -> Float64[np.nda
     """Turns an approximate up direction to the mean normal of the near-horizontal surfaces. Unit vector."""
     normals, areas = face_geometry(mesh)
     up = unit(np.asarray(up, np.float64)[None])[0]
+    # Narrower each time: the better up is known, the less a sloping surface may turn it
     for limit_deg in (LEVEL_DEG, LEVEL_DEG / 2, LEVEL_DEG / 4):
         cosines = normals @ up
         flat = np.abs(cosines) > np.cos(np.radians(limit_deg))
+        # Normals of ceilings point down: by the sign they count for the same direction
         total = ((areas * np.sign(cosines))[flat, None] * normals[flat]).sum(axis=0)
         if np.linalg.norm(total) > 0:
             up = total / np.linalg.norm(total)
@@ -104,7 +106,7 @@ def save_png(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    _, data = cv2.imencode(".png", image[..., ::-1])
+    _, data = cv2.imencode(".png", image[..., ::-1])  # OpenCV takes BGR
     write_atomically(Path(path), data.tobytes())
 
 
@@ -132,6 +134,7 @@ def _filled_pixels(
     """Pixels into which points fall that face the camera."""
     seen = np.einsum("ti,ti->t", normals, T_world_cam[:3, 3] - points) > 0
     p_cam = transform_back(T_world_cam, points[seen])
+    # All are within the picture, which the eye was placed for
     u, v = np.rint(project(p_cam, intrinsics)).astype(np.int64).T
     return len(np.unique(v * intrinsics.width + u))
 
@@ -163,6 +166,7 @@ def _overview_pose(
     elevation = np.radians(ELEVATION_DEG)
     forward = np.cos(elevation) * heading - np.sin(elevation) * up
     sideways = np.cross(heading, up)
+    # x right, y down, z forward, as of any camera here
     axes = np.stack([sideways, np.cross(forward, sideways), forward], axis=1)
     return from_parts(axes, axes @ _fitted_eye(points @ axes, size))
 
@@ -174,9 +178,11 @@ def _fitted_eye(points: Float64[np.ndarray, "V 3"], size: tuple[int, int]) -> Fl
     view, and so on for each edge: four linear bounds, which leave x_eye, y_eye and the greatest z_eye.
     """
     tangents = np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2) * np.array([1.0, size[1] / size[0]])
+    # What fits into a view narrower by the margins leaves them free in the whole one
     tangents *= 1.0 - 2.0 * FRAME_FRACTION
     low = (points[:, :2] + tangents * points[:, 2:]).min(axis=0)
     high = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    # Both bounds of an axis meet at a z_eye; the axis that asks for more distance decides
     z_eye = ((low - high) / (2.0 * tangents)).min()
     return np.array([*(0.5 * (low + high)), z_eye])
 
@@ -185,6 +191,7 @@ def _horizontal_axes(
     up: Float64[np.ndarray, "3"],
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
     """Two unit vectors perpendicular to up and to each other."""
+    # The axis least along up: the product with one almost parallel to it is little but rounding
     helper = np.eye(3)[int(np.argmin(np.abs(up)))]
     right = unit(np.cross(helper, up)[None])[0]
     return right, np.cross(up, right)

@@ -50,12 +50,14 @@ def reconstruct(state: SlamState, cfg: Config, voxel_m: float | None = None) -> 
     state = _moved(state, -away)
     blended = Blend(state, cfg, margin_m)
     found = extract(
+        # Without colours, which are wanted at the vertices alone
         lambda points: blended(points, lambda b: (b.psi, b.entropy), colored=False),
         observed_points(state, cfg),
         voxel_m,
         margin_m=margin_m,
         color=lambda points: blended(points, lambda b: b.color, colored=True),
         band_m=mesh.band,
+        # A share of log C, the entropy of an even distribution; a regressed distance has none to judge by
         max_entropy=mesh.max_entropy * np.log(cfg.field.classes) if cfg.field.classification else None,
         min_component_m2=mesh.min_component_m2,
     )
@@ -103,6 +105,7 @@ class Blend:
 
     def __init__(self, state: SlamState, cfg: Config, margin_m: float = 0.0) -> None:
         self._state, self._cfg = state, cfg
+        # Cells as wide as the margin, since trust reaches one cell beyond what was measured
         self._reach = max(margin_m, cfg.field.truncation)
         self._observed = [self._of_submap(submap) for submap in state.submaps]
 
@@ -112,12 +115,14 @@ class Blend:
             np.linalg.norm(p - k.T_sub_cam[None, :3, 3], axis=1)
             for p, k in zip(points, submap.keyframes, strict=True)
         ]
+        # By the nearest range a surface was measured from: noise of depth grows with its square
         trust = precision(np.concatenate(ranges), self._cfg.sensor)
         return observe(np.concatenate(points), trust, self._reach)
 
     def __call__(self, points: Points, wanted: Callable[[blend.Blended], Any], colored: bool) -> Any:
         """What is wanted of the blend, in padded chunks of one size: one compilation."""
         count = len(points)
+        # One chunk at least, so that no points, too, have a result of the right form
         padded = np.zeros((max(1, -(-count // CHUNK_POINTS)) * CHUNK_POINTS, 3))
         padded[:count] = points
         chunks = padded.reshape(-1, CHUNK_POINTS, 3)
@@ -147,6 +152,7 @@ class Blend:
             T_sub_world = inverse(submap.T_world_sub)
             there = transform(T_sub_world, points)
             trust = trust_at(observed, there)
+            # Where a submap counts for nothing its networks, the costly part, are not asked
             if (trust > 0).any():
                 T = jnp.asarray(T_sub_world @ middle, jnp.float32)
                 total = blend.add(total, submap.learned.field, T, jnp.asarray(trust), near, cfg, colored)

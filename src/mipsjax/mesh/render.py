@@ -83,6 +83,7 @@ class Caster:
         color = np.empty((height * width, 3), np.uint8)
         depth = np.zeros(height * width, np.float32)
         for rows, directions in _pixel_rays(intrinsics):
+            # Not made unit vectors: z is 1 in the camera, so that multiples of them are z-depths
             rays = directions @ T_world_cam[:3, :3].T
             hits = self._cast(np.broadcast_to(T_world_cam[:3, 3], rays.shape), rays)
             lamp = T_world_cam[:3, :3] @ LAMP_CAM if shaded else None
@@ -96,7 +97,9 @@ class Caster:
         face = np.full(len(rays), -1)
         depth, weights = np.zeros(len(rays)), np.zeros((len(rays), 3))
         if self._intersector is not None:
+            # Embree works in single precision: only which triangle is hit comes from it
             face = np.array(self._intersector.intersects_first(origins, rays), dtype=np.int64)
+        # A ray that hits nothing has face -1, reads the last normal here, and is no hit below
         along = np.einsum("ri,ri->r", self._face_normals[face], rays) if len(self._face_normals) else depth
         face[np.abs(along) < PARALLEL] = -1
         hit = face >= 0
@@ -121,6 +124,7 @@ class Caster:
         color = np.einsum("rk,rkc->rc", hits.weights[hit], self._colors[vertices].astype(np.float64))
         if lamp is not None:
             normals = self._interpolated_normals(hits.face[hit], vertices, hits.weights[hit])
+            # A surface seen from behind is lit as from the front
             toward_viewer = -np.sign(np.einsum("ri,ri->r", normals, rays[hit]))
             lit = 0.5 + 0.5 * toward_viewer * (normals @ lamp)
             color *= (AMBIENT + (1.0 - AMBIENT) * lit)[:, None]
@@ -176,7 +180,8 @@ def _barycentric(
     a, b, c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb = (np.einsum("ri,ri->r", p, q) for p, q in ((a, a), (a, b), (b, b)))
     ca, cb = np.einsum("ri,ri->r", c, a), np.einsum("ri,ri->r", c, b)
-    denominator = np.maximum(aa * bb - ab * ab, np.finfo(np.float64).tiny)
+    denominator = np.maximum(aa * bb - ab * ab, np.finfo(np.float64).tiny)  # 0 of a triangle without area
+    # One after the other, so that the three still sum to 1
     v = np.clip((bb * ca - ab * cb) / denominator, 0.0, 1.0)
     w = np.clip((aa * cb - ab * ca) / denominator, 0.0, 1.0 - v)
     return np.stack([1.0 - v - w, v, w], axis=1)

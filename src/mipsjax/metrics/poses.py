@@ -89,6 +89,7 @@ def absolute_error(T_world_cam: Poses, T_truth_cam: Poses) -> AbsoluteError:
     usable, missing_truth, missing_estimate = _usable(T_world_cam, T_truth_cam)
     _require(int(usable.sum()), MIN_POSES, "ATE")
     estimate, truth = T_world_cam[usable, :3, 3], T_truth_cam[usable, :3, 3]
+    # Without scale: depth measures it, so that a wrong one is an error of the estimate
     T_truth_world = align_rigid(estimate, truth)
     aligned = transform(T_truth_world, estimate)
     found = statistics(np.linalg.norm(aligned - truth, axis=1))
@@ -131,6 +132,7 @@ def translation_error(T_world_cam: Poses, T_truth_cam: Poses) -> TranslationErro
         InputError: fewer than two pairs of poses are finite.
     """
     usable, missing_truth, missing_estimate = _usable(T_world_cam, T_truth_cam)
+    # The first pair is zero by construction: one more is needed to say anything
     _require(int(usable.sum()), 2, "TE")
     estimate, truth = T_world_cam[usable], T_truth_cam[usable]
     # Inverses of the first pose of each, so that both begin at the identity

@@ -116,6 +116,7 @@ def sample_surface(
         raise InputError("the mesh has no surface to measure: it is empty, degenerate or not finite")
     rng = np.random.default_rng(seed)
     place = (np.arange(count) + rng.random(count)) * (cumulative[-1] / count)
+    # To the right, so that no point falls on a face without area
     face = np.minimum(np.searchsorted(cumulative, place, side="right"), len(cumulative) - 1)
     # the square root makes the density even over a triangle
     outward, across = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
@@ -172,6 +173,7 @@ def compare_meshes(
         InputError: a mesh is empty, or the views saw nothing of one.
     """
     points = sample_surface(mesh, count, seed)
+    # Another seed: by the same draws two equal meshes would be no distance apart
     true_points = sample_surface(reference, count, seed + 1)
     if views is None:
         return MeshError(compare_points(points, true_points, threshold_m), None, 1.0)
@@ -201,6 +203,7 @@ def observed(
     seen = np.zeros(len(points), bool)
     for T_world_cam, depth in zip(views.T_world_cam, views.depths, strict=True):
         if np.isfinite(T_world_cam).all():
+            # What one view saw is seen, whatever the others show
             open_points = np.flatnonzero(~seen)
             visible = _visible(
                 points[open_points], T_world_cam, views.intrinsics, np.asarray(depth), tolerance_m
@@ -249,6 +252,7 @@ def color_psnr(
         if np.isfinite(pose).all():
             found = caster.render(pose, intrinsics, shaded=False)
             covered = found.depth > 0
+            # In floats: differences of bytes would wrap round at 0
             total += float(((found.color.astype(np.float64) - color) ** 2)[covered].sum())
             pixels, seen = pixels + int(covered.sum()), seen + covered.size
     if pixels == 0:

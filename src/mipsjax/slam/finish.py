@@ -64,6 +64,7 @@ def _adjusted(state: SlamState, submap_id: SubmapId, cfg: Config) -> SlamState:
     calls = -(-cfg.map.final_steps // BATCH_STEPS)  # rounded up
     for call in range(calls):
         rng = np.random.default_rng((cfg.seed, FINISH, submap_id, call))
+        # Mapping is compiled for so many: of fewer keyframes some are drawn twice
         fresh = len(keyframes) < cfg.map.frames
         chosen = [int(i) for i in rng.choice(len(keyframes), cfg.map.frames, replace=fresh)]
         fall = 1 - call / calls
@@ -85,6 +86,7 @@ def _aligned(state: SlamState, submap_id: SubmapId, trust: float, cfg: Config) -
     own = [i for i, r in enumerate(records) if r.submap == submap_id and r.depth is not None]
     for begin in range(0, len(own), ALIGNED):
         group = own[begin : begin + ALIGNED]
+        # Full groups only, so that one compilation serves any number of frames
         filled = [group[i % len(group)] for i in range(ALIGNED)]
         depth = np.stack([to_metres(records[i]) for i in filled])
         start = np.stack([pose_of(state, records[i]) for i in filled]).astype(np.float32)

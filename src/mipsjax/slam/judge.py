@@ -18,6 +18,7 @@ def judged(state: SlamState, cfg: Config) -> Agreement | None:
     few see the same. Warns where they contradict each other. No ground truth is needed."""
     trusted = [i for i, r in enumerate(state.records) if r.status in (Status.OK, Status.WEAK)]
     seen = [i for i in trusted if state.records[i].depth is not None]
+    # Evenly over the run, so that what was seen late is compared with what was seen early
     indices = seen[:: max(1, -(-len(seen) // MOST_VIEWS))]
     if not indices:
         return None

@@ -129,6 +129,7 @@ def with_corners(state: SlamState, newest: Corners | None, found: list[Seen], cf
     wanted = cfg.track.corners
     seen = {one.reference.record for one in found}
     keyframes = [old for old in state.corners if state.records[old.record].is_keyframe]
+    # Newest first. A frame that shows none at all, as in the dark, does not say which are out of sight
     kept = keyframes[:1] + [old for old in keyframes[1:] if not seen or old.record in seen]
     if len(kept) > wanted.keyframes:
         kept = kept[: min(1, wanted.keyframes)] + kept[len(kept) - wanted.keyframes + 1 :]

@@ -59,6 +59,7 @@ class Decision(NamedTuple):
 
 def decide(stats: FrameStats, cfg: Config) -> Decision:
     """Status, keyframe and mapping effort of one tracked frame."""
+    # The next search is wider for what this frame shows, not for how far the camera may be astray
     status, in_trouble = _status(stats, cfg), _is_weak(stats, cfg)
     if status is Status.LOST or _is_sparse(stats, cfg):
         return Decision(
@@ -93,6 +94,7 @@ def _status(stats: FrameStats, cfg: Config) -> Status:
     guard = cfg.guard
     unknown = stats.known < guard.lost or stats.confirmed < guard.confirmed
     limit = max(_allowed(stats, cfg), guard.noise * stats.least_residual)
+    # As long as there is no least residual nobody knows the sensor's noise
     misfit = stats.residual > limit and stats.least_residual > 0
     if not stats.finite or unknown or misfit:
         return Status.LOST
@@ -121,6 +123,7 @@ def _is_keyframe(stats: FrameStats, cfg: Config) -> bool:
     if stats.since_keyframe < cfg.keyframe.every_frames:
         return False
     moved = stats.translation > cfg.keyframe.translation or stats.rotation > cfg.keyframe.rotation
+    # By what is known as in the paper, by motion beside it
     return moved or stats.known < cfg.keyframe.known
 
 

@@ -35,6 +35,7 @@ def find_again(state: SlamState, keyframe: Keyframe, cfg: Config) -> Relocation 
         return None
     known = state.submaps[found.submap].keyframes
     (beside,) = nearest(known, found.T_sub_cam, 1)
+    # In the order of a twist, shifts first: what registration may be off by beside the keyframe
     own = np.repeat([cfg.loop.sigma, cfg.loop.sigma_rotation], 3) ** 2
     covariance = beside.covariance + carried(np.diag(own), found.T_sub_cam)
     return Relocation(activated(state, found.submap), beside, found.T_sub_cam, covariance)
@@ -44,6 +45,7 @@ def lost_in_a_row(state: SlamState, enough: int) -> int:
     """Lost frames up to now, `enough` at most; skipped ones between them do not count."""
     tracked = (r.status for r in reversed(state.records) if r.status is not Status.SKIPPED)
     lost = takewhile(lambda status: status is Status.LOST, tracked)
+    # No farther back than is asked for: a frame costs the same however many there were
     return sum(1 for _ in islice(lost, enough))
 
 

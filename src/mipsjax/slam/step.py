@@ -69,6 +69,7 @@ def start(
         FrameId(frame.number), frame.timestamp, first, anchor.id, np.eye(4), Status.OK, is_keyframe=True
     )
     state = with_corners(SlamState((submap,), first, Records.of([record]), camera, 0), corners, [], cfg)
+    # Now, while nobody waits for a frame: programs that are needed where two submaps first meet
     prepare(state, cfg)
     return state, info
 
@@ -113,6 +114,7 @@ def _processed(
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         note = f"known {stats.known:.2f}, confirmed {stats.confirmed:.2f}, residual {1e3 * stats.residual:.0f} mm"
+        # Recovery may enter the submap that is being refined: what becomes of that is taken over first
         return _recover(taken_over(state, executor, cfg), frame, note, tracked, cfg)
     learned, info = _learn(state, frame, tracked, decision, cfg)
     if decision.informative:
@@ -136,6 +138,7 @@ def _order(state: SlamState, cfg: Config, executor: Executor) -> tuple[SlamState
 
     Returns what went wrong with that one, too; empty where nothing did.
     """
+    # First, since it is asked of the grown box whether the camera leaves it
     state = with_grown_box(state, cfg)
     judgement = judge(state, propose(state, cfg), cfg)
     state = commit(state, judgement, cfg)
@@ -169,6 +172,7 @@ def _recover(
     record = record._replace(held=held, depth=thumbnail(frame.depth, state.camera), is_keyframe=begun)
     info = info_of(tracked)._replace(found=how, submap=state.active, keyframe=begun)
     records = state.records.appended(record)
+    # Nobody saw how the camera moved to here: no motion to go on with, and a wider search
     return state._replace(records=records, frames_in_trouble=1, motion=None), info
 
 
@@ -192,6 +196,7 @@ def _learn(
             current = make_keyframe(frame, record_id, T_sub_cam, cfg, state.camera)
         current = current._replace(covariance=tracked.held.covariance)
         chosen = choose(state.submap, cfg.map.frames - 2, (cfg.seed, CHOOSE, record_id))
+        # The frame takes part as the last keyframe, and goes again where it does not become one
         batch = state.submap._replace(keyframes=(*state.submap.keyframes, current))
         steps, share = decision.map_steps, decision.pose_rate
         newest = len(batch.keyframes) - 1
@@ -256,9 +261,12 @@ def _coast(
 def _moved_on(state: SlamState, before: SlamState, tracked: Tracked, residual: float) -> SlamState:
     """With motion and residual after a trusted frame."""
     newest, older = state.records[-1], last_trusted(before)
+    # In the submap, whose pose in the world may jump where a known one takes over
     T_older_newer = inverse(pose_of(state, before.records[-1])) @ pose_of(state, newest)
+    # Along what is left loose the motion is believed by a gain of its own (`_believed`)
     T_older_newer = T_older_newer @ inverse(tracked.T_sub_cam) @ tracked.T_as_moved
     motion = Motion(T_older_newer, newest.timestamp - older.timestamp)
+    # Falls at once and rises slowly: one frame that fits badly says little of the sensor's noise
     over = max(residual - before.residual, 0.0)
     floor = min(residual, before.residual + RESIDUAL_RISE * over) if before.residual else residual
     return state._replace(motion=motion, residual=floor)

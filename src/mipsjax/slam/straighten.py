@@ -74,6 +74,7 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     if len(near) < AGREEING * len(nodes):
         return state, trust
     pairs = [_followed(nodes, *both, state, cfg) for both in near]
+    # With all trust first: how far colour can be trusted follows from what it says by itself
     measured = _measured(nodes, pairs, 1.0, state, cfg)
     differences = [of_pair(measured, number) for number in range(len(pairs))]
     trust = trusted([difference for difference in differences if difference is not None], ALLOWED, trust)
@@ -126,6 +127,7 @@ def _near(poses: Float64[np.ndarray, "N 4 4"], cfg: Config) -> Iterator[tuple[in
         farther_back = within[within < second - wanted.before]
         # A radian is as far as a metre, as elsewhere
         nearest = farther_back[np.argsort((shift + turn)[farther_back], kind="stable")][: wanted.others]
+        # Which sorts by index, and so by time
         oldest = np.setdiff1d(farther_back, nearest)[: wanted.oldest]
         for first in sorted({*chosen.tolist(), *nearest.tolist(), *oldest.tolist()}):
             yield first, second
@@ -217,6 +219,7 @@ def _covariance(information: ArrayLike) -> Float64[np.ndarray, "6 6"] | None:
     if not np.isfinite(firm).all() or np.linalg.eigvalsh(firm)[0] <= 0:
         return None
     covariance, order = np.linalg.inv(firm), [3, 4, 5, 0, 1, 2]
+    # Symmetric again after rounding, as the pose graph demands
     covariance = (covariance + covariance.T)[np.ix_(order, order)] / 2
     return covariance if np.linalg.eigvalsh(covariance)[0] > 0 else None
 

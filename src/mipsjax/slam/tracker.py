@@ -69,6 +69,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     """A frame with depth, from where its corners or the motion before it say that it is."""
     assert frame.depth is not None
     began = perf_counter()
+    # Compiled code takes an image in any case; to a black one `images_of` gives none to compare it with
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
     earlier, trust = 1 + cfg.track.corners.keyframes, trusted(state.doubts, ALLOWED_TRACKED)
@@ -86,6 +87,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         random_key(cfg, TRACK, len(state.records)),
         state.camera,
         cfg,
+        # Evenly over the list: its first is the anchor while that is near, and the pose of that is exact
         views_of([near[round(i)] for i in np.linspace(0, len(near) - 1, cfg.track.go.views)]),
         np.float32(converged(state.residual, cfg)),
         landmarks(found, earlier, state.camera, cfg),
@@ -120,6 +122,7 @@ def coasting(state: SlamState, frame: Frame, cfg: Config) -> Held:
     """How far a frame may be off that nothing is measured of, and that is taken to be where the last one was."""
     last, T_sub_cam = state.records[-1], last_pose(state)
     if last.status in TRUSTED:
+        # Its motion is forgotten: a frame that is taken to stand still says nothing of one
         last = last._replace(held=at(last.held.covariance, T_sub_cam))
     return _predicted(None, last, frame, T_sub_cam, cfg)
 
@@ -139,6 +142,7 @@ def _reference(state: SlamState, near: list[Keyframe], found: list[Seen], cfg: C
     known = last_trusted(state)
     metres, _ = deviations_of(state, known)
     if metres <= cfg.track.held.unsure:
+        # By the trace, a radian as much as a metre, as elsewhere
         return min((keyframe.covariance for keyframe in near), key=np.trace)
     seen = {one.reference.record for one in found}
     shown = [keyframe.covariance for keyframe in state.submap.keyframes if keyframe.id in seen]

@@ -76,6 +76,7 @@ def _steps(state: SlamState, cfg: Config) -> dict[SubmapId, list[Step]]:
             added = _begun(state, first, other)
         elif one.parent == second:
             added = _begun(state, second, one)
+        # Only loops have a weight: any other pair counts as kept
         elif cfg.loop.enabled and weights.get((first, second), 1.0):
             added = _registered(state, first, second, cfg)
         else:

@@ -25,7 +25,9 @@ def turn(frame: int, active: SubmapId, submaps: int, cfg: Config) -> tuple[Subma
     inactive = [SubmapId(index) for index in range(submaps) if index != active]
     if not work.every_frames or not work.steps or not inactive or frame % work.every_frames:
         return ()
+    # So many or one: each other number would be compiled anew
     count = work.together if len(inactive) >= work.together else 1
+    # From the number of the frame alone, so that a run that is resumed goes on with the same ones
     first = frame // work.every_frames * count
     return tuple(inactive[(first + i) % len(inactive)] for i in range(count))
 
@@ -51,6 +53,7 @@ def refined(refinement: Refinement, camera: Intrinsics, cfg: Config) -> list[Sub
         for submap, place in zip(submaps, places, strict=True)
     ]
     keys = [jax.random.fold_in(random_key(cfg, BACKGROUND, number), place) for place in places]
+    # One alone goes by what is compiled for the active submap
     if len(submaps) == 1:
         (submap,), (some,), (key,) = submaps, chosen, keys
         after = [adjust_submap(submap, some, work.pose_rate, work.steps, key, camera, cfg, work.rate)[0]]

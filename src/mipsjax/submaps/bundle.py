@@ -39,6 +39,7 @@ def make_keyframe(
     """A frame with colour and depth, at mapping size."""
     assert frame.depth is not None and frame.color is not None
     every = mapping_stride(camera, cfg)
+    # Copies: views would keep the images at full size in memory
     return Keyframe(
         record_id, frame.depth[::every, ::every].copy(), frame.color[::every, ::every].copy(), T_sub_cam
     )
@@ -163,6 +164,7 @@ def adjust(
 
 
 def _batch(submap: Submap, chosen: list[int], share: float) -> tuple[list[Keyframe], list[float]]:
+    # The anchor is number 0. It defines the submap's frame, and never moves
     return [submap.keyframes[i] for i in chosen], [share if i != 0 else 0.0 for i in chosen]
 
 

@@ -225,6 +225,7 @@ def solve(state: SlamState, cfg: Config) -> tuple[SlamState, dict[SubmapPair, fl
         if plane is not None:
             planes.append(plane)
     found = solve_graph(judged.T_world_sub, factors + planes, robust=False)
+    # Where surfaces leave it without a solution, that by shared frames alone
     poses = found.T_world_sub if found.ok else judged.T_world_sub
     for submap_id, T_world_sub in zip(state.submap_ids, poses, strict=True):
         state = state.with_submap(submap_id, T_world_sub=T_world_sub)

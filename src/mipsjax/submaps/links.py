@@ -50,6 +50,7 @@ def best_link(first: Submap, second: Submap, chained: bool, cfg: Config) -> Link
     found = links(first, second)
     if not found or chained:
         return min(found, key=lambda link: link.reach, default=None)
+    # Of two, each is as far off by the other: there is no majority
     if len(found) <= 2:
         return max(found, key=lambda link: link.first.id)
     return found[int(np.argmin(disagreement(found, cfg)))]
@@ -62,6 +63,7 @@ def disagreement(found: list[Link], cfg: Config) -> Float64[np.ndarray, " N"]:
     seconds = np.stack([link.second.T_sub_cam for link in found])
     medians = []
     for link in found:
+        # Each shared frame as this link has it, seen from where the first submap has it
         off = np.linalg.inv(firsts) @ link.T_first_second @ seconds
         shift, turn = lengths(off)
         medians.append(np.median(np.hypot(turn / loop.sigma_rotation, shift / loop.sigma)))
@@ -101,8 +103,10 @@ def chain(state: SlamState, start: SubmapId, end: SubmapId) -> list[SubmapId]:
     among them; empty between parts that were begun apart. Loops are no steps: what they join stays as far apart as it
     was."""
     up, down = _ancestry(state, start), _ancestry(state, end)
+    # Two roots: one of both was begun where the camera had been lost
     if up[-1] != down[-1]:
         return []
+    # What lies above the nearest common ancestor is on no way between them
     while len(up) > 1 and len(down) > 1 and up[-2] == down[-2]:
         up, down = up[:-1], down[:-1]
     return [*up, *down[-2::-1]]
@@ -126,6 +130,7 @@ def sigmas(link: Link, cfg: Config) -> tuple[float, float]:
     """Radians and metres by which a linked pose may be off, from the drift expected on the way to the anchors."""
     loop = cfg.loop
     turn, shift = loop.drift_rotation * link.reach, loop.drift * link.reach
+    # Registration and drift err independently: squares add up
     return float(np.hypot(loop.sigma_rotation, turn)), float(np.hypot(loop.sigma, shift))
 
 

@@ -144,6 +144,7 @@ def expect(state: SlamState, submap_id: SubmapId, cfg: Config) -> Expected:
     keyframe, other, loop = state.submap.keyframes[-1], state.submaps[submap_id], cfg.loop
     way = chain(state, state.active, submap_id)
     by_submaps = inverse(other.T_world_sub) @ state.submap.T_world_sub @ keyframe.T_sub_cam
+    # Empty where they were begun apart; longer where a link would close a loop
     if not 0 < len(way) <= loop.apart:
         return Expected(by_submaps)
     shared = links(other, state.submap)

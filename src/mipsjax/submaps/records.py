@@ -54,6 +54,7 @@ class Records(Sequence[Entry]):
     def __getitem__(self, place: slice) -> tuple[Entry, ...]: ...
 
     def __getitem__(self, place: int | slice) -> Entry | tuple[Entry, ...]:
+        # A range knows what negative places and slices mean, and when to raise IndexError
         places = range(len(self))[place]
         if isinstance(places, int):
             return self._at(places)

@@ -162,6 +162,7 @@ class _Arrays:
 
     def described(self, value: Any) -> Any:
         """A part of the tree, as JSON has it."""
+        # The very type: a bool is an int as well, and a NamedTuple a tuple
         kind = type(value)
         if kind in PLAIN:
             return value
@@ -198,8 +199,10 @@ class _Arrays:
 
 def _write(archive: zipfile.ZipFile, name: str, parts: list[np.ndarray]) -> None:
     """One member: arrays of one type after each other, as one in NumPy's own format."""
+    # NumPy's format has no name for bfloat16, so its bits go by as whole numbers
     kind = np.dtype(np.uint16) if parts[0].dtype == BFLOAT16 else parts[0].dtype
     header = {"descr": kind.str, "fortran_order": False, "shape": (sum(part.size for part in parts),)}
+    # `zipfile` is not told the size when a member begins, and it may be beyond 2 GB
     with archive.open(zipfile.ZipInfo(f"{name}.npy", DATE), "w", force_zip64=True) as member:
         np.lib.format.write_array_header_1_0(member, header)  # pyright: ignore[reportArgumentType]  (any file will do)
         for part in parts:

@@ -271,6 +271,7 @@ def thumbnail(depth: Float32[np.ndarray, "h w"], camera: Intrinsics) -> UInt16[n
     """A small picture of a depth image; 0 stays no measurement."""
     every = thumbnail_stride(camera)
     units = np.round(depth[::every, ::every] / THUMBNAIL_UNIT)
+    # Beyond 13 m it is no measurement, where it would wrap round to a near one
     return np.where(units < 2**16, units, 0).astype(np.uint16)
 
 

@@ -106,6 +106,7 @@ def _matched(
         pair.second.learned.field, jnp.asarray(T_second_first, jnp.float32), surface, cfg
     )
     points, normals, mask, q, met = jax.device_get((*surface, matches.q_k, matches.mask))
+    # What lies outside of the other's box is not missed there
     there = volume.inside(pair.second.box, transform(T_second_first, points.astype(np.float64)))
     expected = int((mask & there).sum())
     if met.sum() < max(cfg.loop.fewest_points, MATCHED * expected):

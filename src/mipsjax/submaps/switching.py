@@ -32,6 +32,7 @@ def begin(
     """
     keyframes = (anchor._replace(T_sub_cam=np.eye(4)), *support)
     learned = mapping.create(random_key(cfg, INIT, anchor.id), cfg)
+    # Filled up to the number of frames that mapping is compiled for
     batch = [keyframes[i % len(keyframes)] for i in range(cfg.map.frames)]
     key = random_key(cfg, MAP, anchor.id)
     learned, _, ok = adjust(learned, batch, [0.0] * len(batch), steps, key, camera, cfg)
@@ -91,6 +92,7 @@ def _begin_here(state: SlamState, cfg: Config) -> tuple[SlamState, str]:
     old = state.submap
     *before, anchor = old.keyframes
     T_new_old = inverse(anchor.T_sub_cam)
+    # The first ones, with which a submap was begun, are not in the order of time
     before.sort(key=lambda keyframe: keyframe.id, reverse=True)
     support = [_support(k, anchor, T_new_old) for k in before[: cfg.volume.support]]
     T_world_sub = old.T_world_sub @ anchor.T_sub_cam

@@ -27,6 +27,7 @@ def open_synth(name: str, frames: slice, input: InputConfig) -> SynthSequence:
     """
     base, *suffixes = name.split("+")
     spec = find(base)
+    # A suffix twice would be a second name of the same sequence
     if spec is None or not set(suffixes) <= set(Degradations._fields) or len(set(suffixes)) < len(suffixes):
         raise InputError(
             f"synth:{name}: no such sequence; choose one of {', '.join(synth_names())} "

@@ -106,7 +106,7 @@ def assemble(
     """
     low = np.min([np.subtract(solid.center, solid.half) for solid in carved], axis=0)
     high = np.max([np.add(solid.center, solid.half) for solid in carved], axis=0)
-    position = np.array([(x, -height, z) for (x, height, z), _ in lights]).reshape(-1, 3)
+    position = np.array([(x, -height, z) for (x, height, z), _ in lights]).reshape(-1, 3)  # y is down
     color = np.array([rgb for _, rgb in lights]).reshape(-1, 3)
     # Real arrays even when the first use of a cached scene is inside a traced function
     with jax.ensure_compile_time_eval():

@@ -146,7 +146,7 @@ def _piece(fixture: Fixture) -> Piece:
             levels = (0.08, 0.45 + 0.1 * a, 0.95, 1.3 + 0.4 * b)
             return shelves(0.6 + 0.4 * a, levels, ("books", color, "clay"), depth=0.30)
         case _:
-            # A door set back: its handle, with the recess carved in `_recess`
+            # A door is set back: nothing of it stands out, and `_recess` carves its niche
             return Piece()
 
 
@@ -154,6 +154,7 @@ def _recess(leg: Leg, fixture: Fixture) -> Solid:
     """The niche of a door."""
     (a, b), right = fixture.sizes, fixture.side * _WIDTH / 2
     half, depth = 0.42 + 0.15 * a, 0.16 + 0.25 * b
+    # Well into the corridor: where boxes overlap little, distances in them are short
     inner = leg.point(fixture.along - half, right - 0.4 * fixture.side)
     outer = leg.point(fixture.along + half, right + depth * fixture.side)
     low, high = np.minimum(inner, outer), np.maximum(inner, outer)

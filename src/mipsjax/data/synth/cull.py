@@ -116,6 +116,7 @@ def _reached(
     while waiting:
         box = waiting.pop()
         shared = grown.within(carved.low[box], carved.high[box])
+        # By a hair, so that boxes with a face in common touch whatever was rounded
         touching = carved.grown(1e-6).within(carved.low[box], carved.high[box]).filled()
         for other in np.flatnonzero(touching):
             passed = _passed(_Plan(shared.low[other], shared.high[other]), position, axes, reached[box])

@@ -46,6 +46,7 @@ def _write_frame(folder: Path, frame: Frame) -> None:
     assert frame.color is not None and frame.depth is not None, "synthetic frames are whole"
     _write_png(folder / _file("rgb", frame.timestamp), cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
     units = np.round(frame.depth * DEPTH_UNITS_PER_METRE)
+    # Where 16 bits would wrap round to something near
     beyond = units > np.iinfo(np.uint16).max
     _write_png(folder / _file("depth", frame.timestamp), np.where(beyond, 0.0, units).astype(np.uint16))
 

@@ -29,6 +29,7 @@ class Piece(NamedTuple):
 
         def moved(solid: Solid) -> Solid:
             x, y, z = solid.center
+            # y is down: what is lifted has less of it
             center = (place[0] + cosine * x + sine * z, y - lift, place[1] + cosine * z - sine * x)
             return solid._replace(center=center, turn_deg=solid.turn_deg + turn_deg)
 

@@ -97,7 +97,9 @@ def _furnish(plan: Plan, number: int, alike: list[int], bare: float) -> Furnishe
         walked.append(ways(plan, other).moved((dx, dz)))
     found, pieces = list[Space](), [_ceiling_lamp(plan, room, stream(plan.seed, _FURNITURE, room.style, 0))]
     for rank, thing in enumerate(things(room.use, stream(plan.seed, _FURNITURE, room.style, 1))):
+        # One of its own for each thing: however often one is tried, the others stay
         draws = stream(plan.seed, _FURNITURE, room.style, 2, rank)
+        # What matters most is never left out to make a home barer
         if rank and draws.chance(bare):
             continue
         for _ in range(_TRIES):

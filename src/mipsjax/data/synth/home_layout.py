@@ -67,6 +67,7 @@ def _row(cell: Cell, axis: int, count: int, draws: Draws, even: bool) -> list[Ce
 
 def _cut(cell: Cell, axis: int, share: float) -> tuple[Cell, Cell]:
     """Two parts with a wall between them; `share` is that of the first."""
+    # As if a wall stood behind the last room, too: even shares then make rooms of one size
     end = round(cell.low[axis] + share * (cell.side(axis) + WALL) - WALL, 2)
     begin = round(end + WALL, 2)
     if axis == 0:

@@ -168,6 +168,7 @@ def _doors(cells: list[Cell], corridor: Cell | None, draws: Draws) -> tuple[Door
     Doors into the corridor come before doors between rooms.
     """
     rooms = [*cells, corridor] if corridor is not None else cells
+    # Rooms of one number have a way to each other
     group = list(range(len(rooms)))
     found, wished = list[Door](), list[Door]()
     for pair in sorted(combinations(range(len(rooms)), 2), key=lambda pair: pair[1] < len(cells)):
@@ -184,6 +185,7 @@ def _doors(cells: list[Cell], corridor: Cell | None, draws: Draws) -> tuple[Door
 
 def _door(rooms: list[Cell], pair: tuple[int, int], draws: Draws) -> Door | None:
     """A door in the wall between two rooms, if they have a wall in common that is wide enough."""
+    # Drawn whether there is room or not, so that a door moves no draw of another pair's
     width = draws.between(1.0, 1.25)
     place = draws.between(0.0, 1.0)
     a, b = rooms[pair[0]], rooms[pair[1]]
@@ -207,6 +209,7 @@ def _windows(rooms: tuple[Room, ...], draws: Draws) -> tuple[Window, ...]:
         ends = min(room.cell.low[axis] for room in rooms), max(room.cell.high[axis] for room in rooms)
         for number, room in enumerate(rooms):
             for end, outward in zip((room.cell.low, room.cell.high), (-1, 1), strict=True):
+                # Nothing is built beyond the outermost walls; others may have a room behind them
                 if end[axis] not in ends or not draws.chance(0.7):
                     continue
                 width = min(draws.between(0.9, 1.8), room.cell.side(1 - axis) - 0.7)

@@ -117,6 +117,7 @@ def _along(loop: Line, first: int, last: int, side: int) -> Line:
 
 def _even(points: Line, closed: bool) -> Line:
     """The line with rounded corners, its points about `STEP` apart; a closed one without its first again."""
+    # Rounded corners bring points closer together: the second time they are only spaced evenly
     for width in (_CORNER / STEP, 0.0):
         corners = np.concatenate([points, points[:1]]) if closed else points
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])

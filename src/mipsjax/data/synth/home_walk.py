@@ -155,6 +155,7 @@ def _steadied(angle: Samples, slope: float, closed: bool) -> Samples:
     """An angle that changes by at most `slope` a metre: midway between the two nearest ones that bound it."""
     count = len(angle)
     if closed:
+        # Three times round, and the middle one taken: the bound holds across the end as well
         turns = 2.0 * np.pi * np.round((angle[-1] - angle[0]) / (2.0 * np.pi))
         angle = np.concatenate([angle - turns, angle, angle + turns])
     bounded = 0.5 * (_below(angle, slope * STEP) - _below(-angle, slope * STEP))

@@ -124,6 +124,7 @@ def _timing(
     width = _SMOOTHING_M / np.mean(steps)
     wished = np.clip(pace(along / np.sum(steps)), low, high)
     smooth = gaussian_filter1d(wished, width, mode="wrap" if closed else "nearest")
+    # Once more within limits: smoothing carries speed over into narrow ones
     return np.concatenate([[0.0], np.cumsum(steps / np.clip(smooth, low, high))])
 
 

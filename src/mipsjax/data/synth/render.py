@@ -76,6 +76,7 @@ def render(scene: Scene, intrinsics: Intrinsics, T_world_cam: Float64[np.ndarray
         _view(in_view(scene, intrinsics, pose), jnp.asarray(pose, jnp.float32), pinhole, height, width)
         for pose in T_world_cam
     ]
+    # Before the display's encoding: light adds up, grey levels do not
     light = np.mean([np.asarray(color) for color, _, _ in views], axis=0)
     _, depth, glass = views[len(views) // 2]
     return Image(display(light), np.asarray(depth), np.asarray(glass))
@@ -158,6 +159,7 @@ def _first_contact(scene: Scene, rays: Rays, after: Float[Array, "N"]) -> Float[
 def _end_of_room(carved: Shapes, rays: Rays) -> Float[Array, "N"]:
     """Where rays leave the union of the carved boxes, passing from one into the next."""
     entry, leave = jax.vmap(lambda shape: _through_box(rays, shape))(carved)
+    # A box that a ray misses leads nowhere
     leave = jnp.where(entry < leave, leave, 0.0)
 
     def pass_on(_: Array, reached: Array) -> Array:

@@ -133,6 +133,7 @@ def living_room() -> Scene:
     """A furnished living room of 5 x 4 x 2.6 m: structure for depth and texture for colour in every view."""
     carved = [
         hollow((-2.5, -2.0), (2.5, 2.0), 0.0, 2.6, ("parquet", "plaster", "ceiling")),
+        # Well into the room, as the window's: where boxes overlap little, distances in them are short
         hollow((1.5, 0.45), (2.68, 1.35), 0.0, 2.05, ("parquet", "door", "white")),
         hollow((-0.65, 1.0), (0.75, 2.22), 0.88, 1.25, ("oak", "glass", "white")),
     ]

@@ -108,6 +108,7 @@ class Scene(NamedTuple):
             lambda *rows: jnp.concatenate(rows)[index], self.carved, self.boxes, self.cylinders
         )
         normal = _normals(shapes, self._kind(index), points)
+        # y is down: the normal of a floor has -1 there, that of a ceiling 1
         face = (normal[:, 1] > -_HORIZONTAL).astype(jnp.int32) + (normal[:, 1] > _HORIZONTAL)
         material = jnp.take_along_axis(shapes.material, face[:, None], axis=1)[:, 0]
         return Surface(distance, normal, material)

@@ -53,7 +53,9 @@ def measured_depth(
     seen = _jittered(model, depth, rng)
     out_of_range = (seen < model.range_min) | (seen > model.range_max)
     noisy = seen + depth_sigma(model, seen) * rng.standard_normal(depth.shape)
+    # Noise may lead to the lens and behind it, where depth has no inverse
     inverse = np.round(1.0 / np.maximum(noisy, model.noise_floor) / model.disparity_step)
+    # A disparity of 0 would be infinitely far
     reported = 1.0 / (model.disparity_step * np.maximum(inverse, 1.0))
     return np.where(lost | out_of_range, 0.0, reported).astype(np.float32)
 
@@ -91,6 +93,7 @@ def _at_edge(model: SensorModel, depth: Float32[np.ndarray, "H W"]) -> Bool[np.n
     """Where inverse depth bends: on a plane it is linear over the image, however slanted."""
     inverse = np.pad(1.0 / depth, 1, mode="edge")
     bends = np.diff(inverse, n=2, axis=0)[:, 1:-1], np.diff(inverse, n=2, axis=1)[1:-1]
+    # Times depth: relative, so that a step counts alike close by and far away
     return np.maximum(np.abs(bends[0]), np.abs(bends[1])) * depth > model.edge_step
 
 
@@ -112,5 +115,6 @@ def _tangent(points: Float[np.ndarray, "H W 3"], axis: int) -> Float[np.ndarray,
     """Difference to the next or to the previous pixel along an axis, whichever is smaller in depth."""
     steps = np.diff(points, axis=axis)
     first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
+    # The last pixel has no next one and the first none before: the step on the other side counts
     ahead, behind = np.concatenate([steps, last], axis=axis), np.concatenate([first, steps], axis=axis)
     return np.where(np.abs(ahead[..., 2:]) < np.abs(behind[..., 2:]), ahead, behind)

@@ -96,5 +96,6 @@ class SynthSequence:
     def _measured(
         self, index: int, color: UInt8[np.ndarray, "H W 3"], depth: Float32[np.ndarray, "H W"]
     ) -> tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
+        # By the frame's own number: the same noise whichever frames are chosen, in any order
         rng, model = np.random.default_rng([_SENSOR_SEED, index]), SensorModel()
         return measured_color(model, color, rng), measured_depth(model, depth, self.intrinsics, rng)

@@ -76,6 +76,7 @@ def value_noise(at: Float[Array, "N 3"]) -> Float[Array, "N"]:
     cell = jnp.floor(at)
     part = at - cell
     fx, fy, fz = jnp.moveaxis(part * part * (3.0 - 2.0 * part), -1, 0)
+    # By way of a signed type: what a negative float is without a sign is undefined
     x, y, z = jnp.moveaxis(cell.astype(jnp.int32).astype(jnp.uint32), -1, 0)
     total = jnp.zeros(at.shape[0])
     for dx, dy, dz in [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]:

@@ -77,6 +77,7 @@ def _raised(
     """World points over samples of the line (with fractions, cyclic), moved to its right."""
     rows = np.mod(np.round(at).astype(int), len(line))
     tangent = np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0)
+    # At the ends of an open line the differences go across to the other end
     tangent[[0, -1]] = tangent[[1, -2]]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     x, z = line[rows].T + right * np.stack([tangent[rows, 1], -tangent[rows, 0]])
