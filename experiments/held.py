@@ -403,11 +403,14 @@ def all_of(wanted: list[Task], workers: int, again: bool) -> None:
         finally:
             cores.put(core)
 
+    own: dict[tuple[str, ...], dict[str, Any]] = {}
     with ThreadPoolExecutor(workers) as pool:
         for ended in as_completed([pool.submit(work, task) for task in wanted]):
             row = {"code": now} | ended.result()
-            rows[_key(row)] = row
+            own[_key(row)] = row
             show(row)
+            # Read anew: another process may have added rows of other runs
+            rows = {_key(row): row for row in read_rows("held", RESULTS)} | own
             write_rows("held", rows.values(), RESULTS)
 
 
