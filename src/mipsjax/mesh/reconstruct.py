@@ -1,4 +1,4 @@
-"""From a map to a coloured mesh in the world frame: the blended submaps as functions for `host.meshing`."""
+"""From a map to a coloured mesh in the world frame: the blended submaps as functions for `mesh.meshing`."""
 
 from __future__ import annotations
 
