@@ -5,7 +5,7 @@
 Each run is a process held to one core, two at a time. Writes `docs/held.csv`, a row a run, as each of them ends, and
 in `experiments/out`, where the truth is known, the poses, the mesh and a plan of each: the true and the estimated path
 from above. The whole table takes hours: runs of which there is a row of the same code, by a digest of `src/`, are left
-out unless `--again`. `held_page.py` makes a page of the CSV.
+out unless `--again`. `results.py` makes a page of the CSV.
 
 Groups: `large`, recordings of the development data; `homes`, ten homes drawn from seeds that are for the test, on which
 nobody tuned, slow and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is

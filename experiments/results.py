@@ -1,6 +1,6 @@
-"""`docs/held.md` and the README's table, from `docs/held.csv`, which `held.py` writes, with some of its plans.
+"""`docs/results.md` and the README's table, from `docs/held.csv`, which `held.py` writes, with some of its plans.
 
-python experiments/held_page.py
+python experiments/results.py
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from common import OUT, ROOT, code, read_rows, table
 from held import RESULTS, Task, short, stem
 
-README_MARKS = "<!-- held_page.py -->", "<!-- end -->"
+README_MARKS = "<!-- results.py -->", "<!-- end -->"
 """The README's table is between these two lines."""
 README_GROUPS = "rooms", "kitchen", "large", "homes", "loops"
 README_COLUMNS = (
@@ -68,11 +68,11 @@ COLUMNS = {
     "code": "code",
     "failed": "failed",
 }
-PAGE = """# Held everywhere
+PAGE = """# Results
 
 What holds the camera on recordings and in drawn homes. Nobody tuned on the group `homes`; all others were used in
 tuning, and are no evidence for other scenes. What the columns mean is in the docstring of `experiments/held.py`,
-which writes `held.csv`; `experiments/held_page.py` makes this page from it. Default preset, each run held to one
+which writes `held.csv`; `experiments/results.py` makes this page from it. Default preset, each run held to one
 core. `lost` counts skipped frames too. `code` is a digest of the program; this page was made by {code}, and its rows
 are of {programs}.
 """
@@ -150,7 +150,7 @@ def write_page(rows: list[dict[str, str]]) -> None:
         titles = {key: title for key, title in COLUMNS.items() if any(row.get(key) for row in runs)}
         titled = [{title: row.get(key, "") for key, title in titles.items()} for row in runs]
         parts += [f"## {group.capitalize()}\n", overview(runs), "", table(titled), ""]
-    (RESULTS / "held.md").write_text("\n".join(parts))
+    (RESULTS / "results.md").write_text("\n".join(parts))
 
 
 def write_readme(rows: list[dict[str, str]]) -> None:
