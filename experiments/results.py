@@ -51,6 +51,7 @@ COLUMNS = {
     "lost": "lost",
     "wrong_ok": "ok and over 30 cm off",
     "online_wrong_ok": "ok and over 30 cm off online",
+    "online_ok_off_max_cm": "largest error of an ok frame online, cm",
     "within_3_deviations": "within 3 deviations",
     "online_within_3_deviations": "within 3 deviations online",
     "looked_through": "looked through",
