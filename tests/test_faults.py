@@ -19,7 +19,8 @@ import trimesh
 
 import running
 from compilations import compilations
-from mipsjax.app import outputs, run, signals
+from mipsjax.app import run, signals
+from mipsjax.app.folder import LOCK, claimed, is_ours
 from mipsjax.slam import step as slam
 from mipsjax.slam.info import FrameInfo
 from mipsjax.submaps.state import SlamState
@@ -360,10 +361,10 @@ def test_48_results_are_left_alone(
 
 
 def test_49_a_running_run_is_left_alone(program: Program, sequence: Path) -> None:
-    with outputs.claimed(program.out):
+    with claimed(program.out):
         result = program(sequence)
         assert result.code == 5 and "in use by another run" in result.stderr
-        assert [path.name for path in program.out.iterdir()] == [outputs.LOCK]
+        assert [path.name for path in program.out.iterdir()] == [LOCK]
 
 
 def test_a_folder_that_is_deleted_meanwhile_loses_nothing(
@@ -379,7 +380,7 @@ def test_a_folder_that_is_deleted_meanwhile_loses_nothing(
     result = program(sequence, "--frames", ":3")
     assert result.code == 0 and "deleted or taken" in result.stdout and not program.out.exists()
     beside = program.out.with_name("out-2")
-    assert json.loads((beside / "metrics.json").read_text())["frames"] == 3 and outputs.is_ours(beside)
+    assert json.loads((beside / "metrics.json").read_text())["frames"] == 3 and is_ours(beside)
 
 
 def test_input_is_never_written_to(program: Program, sequence: Path) -> None:

@@ -16,6 +16,7 @@ import pytest
 
 import running
 from mipsjax.app import checkpoint, outputs
+from mipsjax.app.folder import LOCK
 from mipsjax.app.run import main
 from mipsjax.errors import OutputError
 from mipsjax.slam import step as slam
@@ -114,6 +115,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(
     code = f"""
 import os, signal, sys, time
 from pathlib import Path
+from mipsjax.app.folder import LOCK
 from mipsjax.app.run import main
 from mipsjax.slam import step as slam
 step, folder = slam.step, Path(sys.argv[1]) / "checkpoint"
@@ -130,7 +132,7 @@ main(sys.argv[2:])
     arguments = [str(exported), "--preset", "tiny", "--quiet", "--no-mesh", "--out", str(out), *ALWAYS]
     done = subprocess.run([sys.executable, "-c", code, str(out), *arguments])
     assert done.returncode == -signal.SIGKILL
-    assert (out / outputs.LOCK).exists() and not (out / "trajectory.txt").exists()
+    assert (out / LOCK).exists() and not (out / "trajectory.txt").exists()
     refused = program(exported, "--out", str(out))
     assert refused.code == 5 and f"go on with --resume {out}" in refused.stderr
     after = program.plain("--resume", str(out), "--quiet")

@@ -20,6 +20,7 @@ from mipsjax.app import checkpoint, outputs, signals
 from mipsjax.app.checkpoint import Checkpoints, Progress
 from mipsjax.app.commandline import Options, bugs_saved_in, complain, ended, parse, say
 from mipsjax.app.compilation import enable_cache
+from mipsjax.app.folder import choose_folder, claimed, sibling
 from mipsjax.app.resume import end_of, progress_in, resumed_options
 from mipsjax.app.summary import FrameRow, Run, verdict
 from mipsjax.config.sections import CheckpointConfig, Config, InputConfig, MeshConfig
@@ -119,11 +120,11 @@ def _run(options: Options) -> int:
     began = perf_counter()
     sequence = _open(options)
     opened_s = perf_counter() - began
-    folder = options.resume or outputs.choose_folder(sequence.name, options.out, _source(options))
+    folder = options.resume or choose_folder(sequence.name, options.out, _source(options))
     identity, before = checkpoint.identity(cfg, sequence), Progress()
     with (
         signals.noted() as stop,
-        outputs.claimed(folder) as held,
+        claimed(folder) as held,
         bugs_saved_in(folder),
         _warnings(tell) as remarks,
     ):
@@ -152,7 +153,7 @@ def _run(options: Options) -> int:
                 log.warning(remark)
         if not held():
             log.warning("%s was deleted or taken by another run meanwhile", folder)
-            folder = outputs.sibling(folder)
+            folder = sibling(folder)
             outputs.write_config(folder, cfg, _plain_options(options), sequence)
             log.warning("the results go to %s", folder)
         seconds = {"open": opened_s, "judge": judged_s}
