@@ -33,7 +33,7 @@ OUT = Path(__file__).resolve().parent / "out"
 WARM_UP = 5  # frames after which the clock starts: by then everything is compiled
 RATE = 30.0  # frames a second
 EARLY = 200  # frames after which memory is noted, to be compared with the end
-AROUND = ("app/", "run.py", "evaluate.py", "config/options.py")
+AROUND = ("app/", "run.py", "evaluate.py", "config/options.py", "config/ranges.py")
 """Of `src/mipsjax`, the program around the library: no result of an experiment follows from it."""
 
 

@@ -17,7 +17,7 @@ import tyro
 from jaxtyping import Float64
 
 from mipsjax.app.commandline import ended, read_options, say
-from mipsjax.config.options import LARGEST_SEED
+from mipsjax.config.ranges import LARGEST_SEED
 from mipsjax.data.association import associate, sort_stamps
 from mipsjax.data.calibration import FRAME_RATES
 from mipsjax.data.textfile import content_lines
