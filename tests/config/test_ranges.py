@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mipsjax.config.options import flat, merged, validate
-from mipsjax.config.ranges import RANGES, Range
+from mipsjax.config.ranges import RANGES, SMALLEST_SIGMA, Range
 from mipsjax.config.sections import Config, InputConfig
 from mipsjax.config.tracking import GuardConfig
 from mipsjax.errors import ConfigError
+from mipsjax.loops import factors
 
 
 def numeric(value: object) -> bool:
@@ -69,6 +70,16 @@ def test_what_no_machine_can_hold_is_refused(changes: dict[str, object], message
     with pytest.raises(ConfigError) as caught:
         validate(merged(Config(), changes))
     assert message in str(caught.value) and len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("name", ["sigma", "sigma_rotation", "points_sigma"])
+def test_a_deviation_that_no_factor_may_have_is_refused_at_the_start(name: str) -> None:
+    """The pose graph would refuse it at the first loop, which may come after hours."""
+    assert factors.SMALLEST_SIGMA == SMALLEST_SIGMA
+    validate(merged(Config(), {"loop": {name: SMALLEST_SIGMA}}))
+    with pytest.raises(ConfigError) as caught:
+        validate(merged(Config(), {"loop": {name: 0.9 * SMALLEST_SIGMA}}))
+    assert str(caught.value) == f"loop.{name} must be at least 1e-06, got 9e-07"
 
 
 def test_contradictions_are_found() -> None:

@@ -44,11 +44,14 @@ LARGEST_LAYER, MOST_LAYERS = 1024, 8
 """Wider and deeper networks than any of this field, and still megabytes."""
 MOST_SAMPLES = 1 << 20
 """Pixels, points or particles of one call: each takes kilobytes in it."""
+SMALLEST_SIGMA = 1e-6
+"""Radians or metres, as in `loops/factors.py`, which refuses a factor of less and cannot be imported from here."""
 LARGEST_TABLE = 1 << 28
 """Numbers in all levels of a hash grid: a gigabyte, and Adam keeps two more of them."""
 DIGITS_SHOWN = 40
 """Of a value in a message."""
 POSITIVE = Range(0.0, above=True)
+SIGMA = Range(SMALLEST_SIGMA)
 NOT_NEGATIVE = Range(0.0)
 COUNT = Range(1)
 SAMPLES = Range(1, MOST_SAMPLES)
@@ -198,11 +201,11 @@ RANGES: dict[str, Range] = {
     "loop.held": NOT_NEGATIVE,
     "loop.drift": POSITIVE,
     "loop.drift_rotation": POSITIVE,
-    # A measurement with a deviation of 0 would outweigh all others in the pose graph
-    "loop.sigma": POSITIVE,
-    "loop.sigma_rotation": POSITIVE,
+    # A measurement with next to no deviation would outweigh all others in the pose graph
+    "loop.sigma": SIGMA,
+    "loop.sigma_rotation": SIGMA,
     "loop.fewest_points": COUNT,
-    "loop.points_sigma": POSITIVE,
+    "loop.points_sigma": SIGMA,
     "loop.effective_points": POSITIVE,
     "loop.tolerance": POSITIVE,
     "pairs.before": NOT_NEGATIVE,
