@@ -285,3 +285,13 @@ def test_the_run_waits_for_none(interrupted: Path) -> None:
     rows = csv.DictReader((interrupted / "status.csv").read_text().splitlines())
     waited = sorted(float(row["checkpoint_ms"]) for row in rows)
     assert waited[len(waited) // 2] < 5
+
+
+def test_one_has_the_time_that_the_run_waited_for_it(interrupted: Path) -> None:
+    """The one before the last, which was begun beside the frames."""
+    before = checkpoint.read(checkpoint.written(interrupted)[1])
+    rows = list(csv.DictReader((interrupted / "status.csv").read_text().splitlines()))
+    # status.csv has six digits
+    written = [float(row["checkpoint_ms"]) for row in rows[: len(before.infos)]]
+    assert [info.checkpoint_ms for info in before.infos] == pytest.approx(written, rel=1e-5)
+    assert written[-1] > 0

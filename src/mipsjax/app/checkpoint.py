@@ -78,14 +78,20 @@ class Checkpoints:
     def after(self, keyframe: bool, progress: Callable[[], Progress]) -> float:
         """Begins to write one, if it is time for it; milliseconds that the run has waited for that.
 
-        Where the disk is slower than the frames, the next one begins when the last is written.
+        The last frame's info in the checkpoint has them, too. Where the disk is slower than the frames, the next one
+        begins when the last is written.
         """
         began = perf_counter()
         self._keyframes += keyframe
-        if self._due(began) and self._idle():
-            self._keyframes, self._began = 0, began
-            self._writing = self._pool.submit(self._write, self._remarked(progress()))
-        return 1e3 * (perf_counter() - began)
+        if not (self._due(began) and self._idle()):
+            return 1e3 * (perf_counter() - began)
+        self._keyframes, self._began = 0, began
+        # Known only when the thread has what it is to write
+        waited: Future[float] = Future()
+        self._writing = self._pool.submit(self._write_waited, self._remarked(progress()), waited)
+        waited_ms = 1e3 * (perf_counter() - began)
+        waited.set_result(waited_ms)
+        return waited_ms
 
     def last(self, progress: Progress) -> None:
         """Writes one, unless none are wanted, and waits until it is there."""
@@ -107,6 +113,11 @@ class Checkpoints:
 
     def _idle(self) -> bool:
         return self._writing is None or self._writing.done()
+
+    def _write_waited(self, progress: Progress, waited: Future[float]) -> None:
+        """Writes one in which the last frame's info says how many milliseconds the run waited for it."""
+        info = progress.infos[-1]._replace(checkpoint_ms=waited.result())
+        self._write(progress._replace(infos=(*progress.infos[:-1], info)))
 
     def _write(self, progress: Progress) -> None:
         """One that cannot be written ends no run."""
