@@ -405,6 +405,10 @@ def test_too_many_bad_frames(program: Program, sequence: Path) -> None:
     result = program(sequence, "--input.max-bad-frames", "4")
     assert result.code == 3 and "--input.max-bad-frames" in result.stderr
     assert result.metrics["frames"] == 8 and result.metrics["end"] == "bad frames"
+    again = program.plain("--resume", str(result.out))
+    assert (
+        again.code == 3 and "has ended (bad frames)" in again.stderr and "of 8 frames 5 were" in again.stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -425,6 +429,9 @@ def test_lost_for_a_while_and_for_good(
     assert (f"first in frame {lost[0]};" in result.stderr) == (status == "failed")
     assert result.metrics["status_counts"]["lost"] == len(lost)
     assert [event["index"] for event in result.events if event["event"] == "lost"] == list(lost)
+    again = program.plain("--resume", str(result.out))
+    assert again.code == code and "has ended (done)" in again.stdout + again.stderr
+    assert (f"tracking was lost in {len(lost)}:" in again.stderr) == (status == "failed")
 
 
 def test_57_odd_path_and_link(program: Program, sequence: Path) -> None:

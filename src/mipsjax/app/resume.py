@@ -8,13 +8,15 @@ import logging
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mipsjax.app.checkpoint import Progress, identity_in, read, written
 from mipsjax.app.commandline import Options
+from mipsjax.app.summary import failure
 from mipsjax.config.options import merged, validate
 from mipsjax.config.sections import Config
-from mipsjax.errors import ConfigError, InputError
+from mipsjax.errors import ConfigError, InputError, MipsjaxError, TrackingLostError
+from mipsjax.submaps.state import Status
 
 log = logging.getLogger(__name__)
 
@@ -70,14 +72,32 @@ def options_in(folder: Path) -> Options:
     return replace(options, out=folder, intrinsics=intrinsics)
 
 
-def end_of(folder: Path) -> str:
-    """How the run in a folder ended, as its metrics.json says; empty where it was cut short, or its mesh was."""
+class Ended(NamedTuple):
+    """A run that came to its end, so that there is nothing to go on with."""
+
+    text: str
+    """What to tell whoever wants to go on with it: how it ended, in one line."""
+    failure: type[MipsjaxError] | None
+    """The kind of error that it ended with; None if it ended well."""
+
+
+def end_of(folder: Path) -> Ended | None:
+    """How the run in a folder ended, as its metrics.json says; None where it was cut short, or its mesh was."""
     try:
         content = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         end, mesh = content["end"], content["mesh"]
+        frames, counts = content["frames"], content["status_counts"]
+        skipped, lost = counts[str(Status.SKIPPED)], counts[str(Status.LOST)]
+        failed = failure(end, content["status"], frames - skipped)
     except (OSError, ValueError, KeyError, TypeError):
-        return ""
-    return "" if end == "interrupted" or mesh == "unfinished" else end
+        return None
+    if end == "interrupted" or mesh == "unfinished":
+        return None
+    text = f"{folder}: this run has ended ({end}), its results are there"
+    if failed is None:
+        return Ended(text, None)
+    why = f"tracking was lost in {lost}" if failed is TrackingLostError else f"{skipped} were unusable"
+    return Ended(f"{text}; of {frames} frames {why}: begin it again with other options", failed)
 
 
 def progress_in(folder: Path, identity: dict[str, Any]) -> Progress:

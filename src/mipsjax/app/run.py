@@ -22,12 +22,12 @@ from mipsjax.app.commandline import Options, bugs_saved_in, complain, ended, par
 from mipsjax.app.compilation import enable_cache
 from mipsjax.app.folder import choose_folder, claimed, sibling
 from mipsjax.app.resume import end_of, progress_in, resumed_options
-from mipsjax.app.summary import FrameRow, Run, verdict
+from mipsjax.app.summary import MIN_USABLE, FrameRow, Run, failure, verdict
 from mipsjax.config.sections import CheckpointConfig, Config, InputConfig, MeshConfig
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.suspicion import suspicions_of_truth
-from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
+from mipsjax.errors import InputError, MipsjaxError
 from mipsjax.mesh.reconstruct import reconstruct
 from mipsjax.slam import step as slam
 from mipsjax.slam.finish import finish
@@ -40,8 +40,6 @@ log = logging.getLogger(__name__)
 
 LINE_EVERY = 50
 """Frames between two lines of progress where there is no terminal."""
-MIN_USABLE = 2
-"""Frames that make a sequence."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -113,8 +111,10 @@ def _main(arguments: list[str]) -> int:
 def _run(options: Options) -> int:
     """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
     cfg, tell = options.settings, _teller(options.quiet)
-    if options.resume is not None and (end := end_of(options.resume)):
-        tell(f"{options.resume}: this run has ended ({end}), its results are there")
+    if options.resume is not None and (ended := end_of(options.resume)):
+        if ended.failure is not None:
+            raise ended.failure(ended.text)
+        tell(ended.text)
         return 0
     enable_cache()
     began = perf_counter()
@@ -198,22 +198,30 @@ def _exit_code(run: Run, folder: Path) -> int:
         complain(f"interrupted: results up to then are in {folder}{on}")
         return signals.INTERRUPTED
     rows = run.rows
+    usable = sum(row.status is not Status.SKIPPED for row in rows)
+    # Depth images that contradict each other degrade a run, and fail none
+    failed = failure(run.end, verdict(rows), usable)
+    if failed is not None:
+        raise failed(_why(run, folder))
+    return 0
+
+
+def _why(run: Run, folder: Path) -> str:
+    """What is wrong with the results of a run that failed."""
+    rows = run.rows
     bad = [row for row in rows if row.status is Status.SKIPPED]
     if run.end == "bad frames":
-        raise InputError(
+        return (
             f"{len(bad)} of {len(rows)} frames are unusable, the last one: {bad[-1].info.note}; results up "
             f"to then are in {folder}; --input.max-bad-frames allows more"
         )
     if len(rows) - len(bad) < MIN_USABLE:
-        raise InputError(f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}")
-    # Depth images that contradict each other degrade a run, and fail none
-    if verdict(rows) == "failed":
-        lost = [row.number for row in rows if row.status is Status.LOST]
-        raise TrackingLostError(
-            f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
-            f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"
-        )
-    return 0
+        return f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}"
+    lost = [row.number for row in rows if row.status is Status.LOST]
+    return (
+        f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
+        f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"
+    )
 
 
 def _nothing_usable(run: Run) -> MipsjaxError | KeyboardInterrupt:

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.synth import SynthSequence
-from mipsjax.errors import InputError
+from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
 from mipsjax.metrics import surface
 from mipsjax.metrics.poses import absolute_error, relative_error, translation_error
 from mipsjax.slam.info import FrameInfo
@@ -39,6 +39,8 @@ SCHEMA_VERSION = 1
 """Of the output files; rises when a key changes its meaning."""
 REFERENCE_VOXEL_M = 0.02
 """Cells of the true mesh of synthetic scenes: vertices lie on the surface, only edges are cut."""
+MIN_USABLE = 2
+"""Frames that make a sequence."""
 MOST_VIEWS = 60
 """Frames that decide which part of the true mesh was seen; more take long and add little."""
 
@@ -116,10 +118,24 @@ def verdict(rows: tuple[FrameRow, ...], agreement: Agreement | None = None) -> V
     `degraded`: lost at times, or depth images contradict each other."""
     tracked = [row.status for row in rows if row.status is not Status.SKIPPED]
     lost = tracked.count(Status.LOST)
-    if len(tracked) < 2 or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
+    if len(tracked) < MIN_USABLE or tracked[-1] is Status.LOST or 2 * lost > len(tracked):
         return "failed"
     contradicted = agreement is not None and agreement.begins is not None
     return "degraded" if lost or contradicted else "ok"
+
+
+def failure(end: str, status: str, usable: int) -> type[MipsjaxError] | None:
+    """The kind of error that a run whose results are written ends with, which has its exit code; None where they are
+    whole.
+
+    Args:
+        end: how it ended, as in metrics.json.
+        status: its verdict. A degraded run is none that failed.
+        usable: its frames that were not skipped.
+    """
+    if end == "bad frames" or usable < MIN_USABLE:
+        return InputError
+    return TrackingLostError if status == "failed" else None
 
 
 def reasons(run: Run) -> list[str]:
@@ -129,7 +145,7 @@ def reasons(run: Run) -> list[str]:
     if run.agreement is not None and run.state is not None:
         contradicted = contradiction(run.state, run.agreement)
     found = [f"lost in {lost} of {len(statuses)} frames"] if lost else []
-    if len(statuses) - statuses.count(Status.SKIPPED) < 2:
+    if len(statuses) - statuses.count(Status.SKIPPED) < MIN_USABLE:
         found.append("fewer than two usable frames")
     return [*found, contradicted] if contradicted else found
 
