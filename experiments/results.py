@@ -138,11 +138,15 @@ def _kind(row: Mapping[str, str]) -> str:
     return name if row["switch"] == "full" else f"{name}, {row['switch']}"
 
 
+def programs(rows: list[dict[str, str]]) -> str:
+    """Which versions of the program the runs are of, and how many of each."""
+    count = Counter(row["code"] for row in rows)
+    return ", ".join(f"{program} ({runs})" for program, runs in count.most_common())
+
+
 def write_page(rows: list[dict[str, str]]) -> None:
     """All runs, group by group, each after its overview."""
-    count = Counter(row["code"] for row in rows)
-    programs = ", ".join(f"{program} ({runs})" for program, runs in count.most_common())
-    parts = [PAGE.format(code=code(), programs=programs)]
+    parts = [PAGE.format(code=code(), programs=programs(rows))]
     shown = [task for task in PLANS if (RESULTS / f"{stem(task)}.png").exists()]
     parts += [f"![True and estimated path, {short(task.name)}]({stem(task)}.png)" for task in shown]
     parts.append("")
@@ -159,7 +163,8 @@ def write_readme(rows: list[dict[str, str]]) -> None:
     readme = ROOT / "README.md"
     before, marked = readme.read_text().split(README_MARKS[0])  # fails where a mark is missing or doubled
     _, after = marked.split(README_MARKS[1])
-    shown = overview([row for row in rows if row["group"] in README_GROUPS], README_COLUMNS)
+    rows = [row for row in rows if row["group"] in README_GROUPS]
+    shown = f"{overview(rows, README_COLUMNS)}\n\nVersions of the program, with their runs: {programs(rows)}."
     readme.write_text(f"{before}{README_MARKS[0]}\n\n{shown}\n\n{README_MARKS[1]}{after}")
 
 
