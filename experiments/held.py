@@ -196,7 +196,7 @@ def done(task: Task) -> dict[str, Any]:
         row |= {f"online_{key}": value for key, value in online.items()}
         mesh = reconstruct(found.state, cfg)
         row |= loops(found, cfg) | surface(mesh, Path(path) / "observed.npz")
-        keep(found, mesh, OUT / stem(task))
+        keep(found, mesh, OUT / stem(task), row["code"])
     return row
 
 
@@ -205,7 +205,7 @@ def stem(task: Task) -> str:
     return f"held-{short(task.name).replace('/', '-')}-{task.stride}-{task.switch}-{task.seed}"
 
 
-def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
+def keep(found: Run, mesh: trimesh.Trimesh, path: Path, program: str) -> None:
     """Writes, each with its own ending, poses, status and submap of each frame with the loops (frame, two submaps; how;
     kept or not), the mesh, and a plan."""
     path.parent.mkdir(exist_ok=True)
@@ -214,7 +214,7 @@ def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
     closed = found.state.loops
     np.savez_compressed(
         path.with_name(f"{path.name}.npz"),
-        code=code(),
+        code=program,
         poses=poses,
         true=true,
         status=[str(record.status) for record in records],
@@ -225,7 +225,7 @@ def keep(found: Run, mesh: trimesh.Trimesh, path: Path) -> None:
     )
     figure, axes = plt.subplots(figsize=(6, 6))
     plan(axes, poses, true)
-    axes.set_title(f"{path.name} ({code()})", fontsize=8)
+    axes.set_title(f"{path.name} ({program})", fontsize=8)
     axes.legend()
     figure.savefig(path.with_name(f"{path.name}.png"), dpi=100, bbox_inches="tight")
     plt.close(figure)
