@@ -20,7 +20,7 @@ import trimesh
 import running
 from compilations import compilations
 from mipsjax.app import run, signals
-from mipsjax.app.folder import LOCK, claimed, is_ours
+from mipsjax.app.results_folder import LOCK, claimed, is_ours
 from mipsjax.slam import step as slam
 from mipsjax.slam.info import FrameInfo
 from mipsjax.submaps.state import SlamState

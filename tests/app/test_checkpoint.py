@@ -16,7 +16,7 @@ import pytest
 
 import running
 from mipsjax.app import checkpoint, outputs
-from mipsjax.app.folder import LOCK
+from mipsjax.app.results_folder import LOCK
 from mipsjax.app.run import main
 from mipsjax.errors import OutputError
 from mipsjax.slam import step as slam
@@ -115,7 +115,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(
     code = f"""
 import os, signal, sys, time
 from pathlib import Path
-from mipsjax.app.folder import LOCK
+from mipsjax.app.results_folder import LOCK
 from mipsjax.app.run import main
 from mipsjax.slam import step as slam
 step, folder = slam.step, Path(sys.argv[1]) / "checkpoint"

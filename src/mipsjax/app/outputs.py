@@ -1,7 +1,7 @@
 """Everything a run writes into its folder, each file there whole or not at all.
 
 All but the mesh is written before the mesh is made, and `metrics.json` last of it, and again with the mesh. Which
-folder that is, and that nobody else has it, is up to `app/folder.py`.
+folder that is, and that nobody else has it, is up to `app/results_folder.py`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import jax
 import numpy as np
 import trimesh
 
-from mipsjax.app.folder import CONFIG
+from mipsjax.app.results_folder import CONFIG
 from mipsjax.app.summary import SCHEMA_VERSION, FrameRow, Run, loop_rows, metrics_content, verdict
 from mipsjax.config.options import to_dict
 from mipsjax.config.sections import Config

@@ -20,7 +20,7 @@ from mipsjax.app import checkpoint, outputs, signals
 from mipsjax.app.checkpoint import Checkpoints, Progress
 from mipsjax.app.commandline import Options, bugs_saved_in, complain, ended, parse, say
 from mipsjax.app.compilation import enable_cache
-from mipsjax.app.folder import choose_folder, claimed, sibling
+from mipsjax.app.results_folder import choose_folder, claimed, sibling
 from mipsjax.app.resume import end_of, progress_in, resumed_options
 from mipsjax.app.summary import MIN_USABLE, FrameRow, Run, failure, verdict
 from mipsjax.config.sections import CheckpointConfig, Config, InputConfig, MeshConfig

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mipsjax.app.folder import FILES, LOCK, choose_folder, claimed, is_ours, sibling
 from mipsjax.app.outputs import write_config
+from mipsjax.app.results_folder import FILES, LOCK, choose_folder, claimed, is_ours, sibling
 from mipsjax.config.presets import preset
 from mipsjax.data.open import open_sequence
 from mipsjax.errors import OutputError
