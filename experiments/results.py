@@ -74,9 +74,10 @@ PAGE = """# Results
 What holds the camera on recordings and in drawn homes. Nobody tuned on the group `homes`; all others were used in
 tuning, and are no evidence for other scenes. Fast home 6 was looked at to find out why its frames were called `ok`
 while far off; what follows from that was chosen on other homes. What the columns mean is in the docstring of
-`experiments/held.py`, which writes `held.csv`; `experiments/results.py` makes this page from it. Default preset, each run held to one
-core. `lost` counts skipped frames too. `code` is a digest of the program; this page was made by {code}, and its rows
-are of {programs}.
+`experiments/held.py`, which writes `held.csv`; `experiments/results.py` makes this page from it.
+
+Default preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program; this
+page was made by {code}, and its rows are of {programs}.
 """
 
 
