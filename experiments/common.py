@@ -204,13 +204,14 @@ def table(rows: list[dict[str, str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
-def code(source: Path = ROOT / "src") -> str:
-    """What tells programs apart: a digest of `src/` without its comments and docstrings, and without `AROUND`.
+def code(part: str = "mipsjax", source: Path = ROOT / "src") -> str:
+    """What tells programs apart: a digest of `src/`, or of a part of it, without its comments and docstrings, and
+    without `AROUND`.
 
     Of one version of Python: each writes down the syntax in its own way.
     """
     digest = hashlib.sha256()
-    for path in sorted(source.rglob("*.py")):
+    for path in sorted((source / part).rglob("*.py")):
         if path.relative_to(source / "mipsjax").as_posix().startswith(AROUND):
             continue
         tree = ast.parse(path.read_text())

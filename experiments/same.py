@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=RUNS, default=list(RUNS))
     chosen = parser.parse_args()
     checkouts = [chosen.before.resolve(), chosen.after.resolve()]
-    before, after = (code(checkout / "src") for checkout in checkouts)
+    before, after = (code(source=checkout / "src") for checkout in checkouts)
     rows = []
     with ThreadPoolExecutor(2) as pool:
         for name in chosen.only:
