@@ -76,7 +76,9 @@ tuning, and are no evidence for other scenes. Fast home 6 was looked at to find 
 while far off; what follows from that was chosen on other homes. What the columns mean is in the docstring of
 `experiments/held.py`, which writes `held.csv`; `experiments/results.py` makes this page from it.
 
-Default preset, each run held to one core. `lost` counts skipped frames too. `code` is a digest of the program; this
+Default preset, each run held to one core. Frames a second are lower bounds: other work ran beside some of the runs, and
+frames of synthetic sequences that were not kept from an earlier run were rendered meanwhile. `lost` counts skipped
+frames too. `code` is a digest of the program; this
 page was made by {code}, and its rows are of {programs}.
 """
 
