@@ -14,8 +14,8 @@ import pytest
 from flops import matrix_flops
 from mipsjax.config.presets import PRESETS
 from mipsjax.config.sections import Config
+from mipsjax.core import draws, mapping, particles, tracking
 from mipsjax.core import field as nf
-from mipsjax.core import mapping, particles, tracking
 from mipsjax.core.camera import Intrinsics, grid_shape
 from mipsjax.core.encodings import fields
 from mipsjax.core.views import Views
@@ -26,14 +26,14 @@ QUERIES = 100_000
 FIT_STEPS = 100
 
 
-def wall(camera: Intrinsics, frames: int) -> mapping.Frames:
+def wall(camera: Intrinsics, frames: int) -> draws.Frames:
     """A slanted wall 2 m off, `frames` times."""
     depth = np.broadcast_to(
         np.linspace(1.5, 2.5, camera.width, dtype=np.float32), (camera.height, camera.width)
     )
     color = np.full((frames, camera.height, camera.width, 3), 128, np.uint8)
     poses = np.broadcast_to(np.eye(4, dtype=np.float32), (frames, 4, 4))
-    return mapping.Frames(np.tile(depth, (frames, 1, 1)), color, poses, np.arange(frames) > 0)
+    return draws.Frames(np.tile(depth, (frames, 1, 1)), color, poses, np.arange(frames) > 0)
 
 
 def pixels_of(wanted: int, camera: Intrinsics) -> int:

@@ -21,7 +21,8 @@ from mipsjax.core import mapping, tracking
 from mipsjax.core.rigid import distance, exp
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
-from mipsjax.submaps.bundle import MAP, adjust, make_keyframe, random_key
+from mipsjax.submaps.bundle import adjust, make_keyframe
+from mipsjax.submaps.chance import Purpose, key_for
 
 OFFSET_M, OFFSET_RAD = 0.3, np.radians(30)
 DONE_M, DONE_RAD = 0.01, np.radians(0.5)
@@ -38,7 +39,7 @@ def fitted(sequence: Sequence, cfg: Config) -> tuple[mapping.Learned, list[np.nd
     rng = np.random.default_rng(cfg.seed)
     for number in range(STEPS // cfg.map.steps):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
-        rates, key = [0.0] * cfg.map.frames, random_key(cfg, MAP, number)
+        rates, key = [0.0] * cfg.map.frames, key_for(cfg, Purpose.MAP, number)
         submap, _, _ = adjust(submap, batch, rates, cfg.map.steps, key, sequence.intrinsics, cfg)
     return submap, list(truth)
 

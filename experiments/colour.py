@@ -28,7 +28,7 @@ from mipsjax.core import relative
 from mipsjax.core.rigid import distance, inverse
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Frame, Sequence
-from mipsjax.images.corners import follow
+from mipsjax.images.following import follow
 from mipsjax.slam.landmarks import Seen, corners_of, images_of, landmarks
 from mipsjax.submaps.state import Pose
 

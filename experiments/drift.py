@@ -27,7 +27,8 @@ from mipsjax.core.rigid import distance, from_parts, inverse, rotation, to_twist
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
 from mipsjax.images.features import detect
-from mipsjax.submaps.bundle import MAP, adjust, make_keyframe, random_key
+from mipsjax.submaps.bundle import adjust, make_keyframe
+from mipsjax.submaps.chance import Purpose, key_for
 from mipsjax.submaps.closure import solve
 from mipsjax.submaps.ids import FrameId, SubmapId
 from mipsjax.submaps.proposals import proposed, with_links
@@ -72,7 +73,7 @@ def submap(sequence: Sequence, first: int, last: int, cfg: Config) -> Submap:
     learned, rng = mapping.create(jax.random.key(first), cfg), np.random.default_rng(first)
     for call in range(CALLS):
         batch = [keyframes[i] for i in rng.choice(KEYFRAMES, cfg.map.frames, replace=False)]
-        rates, key = [0.0] * len(batch), random_key(cfg, MAP, first + call)
+        rates, key = [0.0] * len(batch), key_for(cfg, Purpose.MAP, first + call)
         learned, _, _ = adjust(learned, batch, rates, STEPS, key, sequence.intrinsics, cfg, 1 - call / CALLS)
     box = None
     small = sequence.intrinsics.decimated(sequence.intrinsics.width // keyframes[0].depth.shape[1])

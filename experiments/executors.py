@@ -29,7 +29,7 @@ import numpy as np
 from common import changed, show, write_rows
 from mipsjax.app.compilation import enable_cache
 from mipsjax.config.sections import Config
-from mipsjax.core import mapping
+from mipsjax.core import draws, mapping
 from mipsjax.data.open import open_sequence
 from mipsjax.data.sequence import Sequence
 from mipsjax.slam import step as slam
@@ -144,13 +144,13 @@ def stacks(devices: bool) -> None:
     write_rows("stacks-2" if devices else "stacks", rows)
 
 
-def five(sequence: Sequence, place: int, cfg: Config) -> mapping.Frames:
+def five(sequence: Sequence, place: int, cfg: Config) -> draws.Frames:
     """The same frame five times, at mapping size."""
     frame, every = sequence[place], round(sequence.intrinsics.width / cfg.map.width_px)
     assert frame.depth is not None and frame.color is not None
     depth, color = frame.depth[::every, ::every], frame.color[::every, ::every]
     five_of = [np.broadcast_to(a, (5, *a.shape)) for a in (depth, color, np.eye(4, dtype=np.float32))]
-    return mapping.Frames(*map(jnp.asarray, five_of), jnp.zeros(5))
+    return draws.Frames(*map(jnp.asarray, five_of), jnp.zeros(5))
 
 
 def timed(way: Callable[[], Any]) -> float:

@@ -30,7 +30,7 @@ from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.metrics.poses import absolute_error
 from mipsjax.slam import step as slam
 from mipsjax.slam import straighten
-from mipsjax.submaps.background import taken_over
+from mipsjax.submaps.background import with_refined
 from mipsjax.submaps.closure import closed_again
 from mipsjax.submaps.schedule import INLINE
 from mipsjax.submaps.state import SlamState
@@ -63,7 +63,7 @@ def travelled(name: str, stride: int, cfg: Config) -> tuple[SlamState, np.ndarra
     state, _ = slam.start(sequence[0], sequence.intrinsics, cfg, true[0])
     for place in range(1, len(sequence)):
         state, _ = slam.step(state, sequence[place], cfg)
-    return closed_again(taken_over(state, INLINE, cfg), cfg), true
+    return closed_again(with_refined(state, INLINE, cfg), cfg), true
 
 
 def row(state: SlamState, true: np.ndarray, form: str, cfg: Config) -> dict[str, Any]:

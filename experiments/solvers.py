@@ -1,4 +1,4 @@
-"""Second-order refinement of a pose: our scan with the closed 6 x 6 system, and optimistix, on the same cost.
+"""Second-order refinement of a pose: our scan with the closed 6 x 6 system, and optimistix, on the same rows.
 
     python experiments/solvers.py [--starts 100]
 
@@ -17,51 +17,37 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 
 from basin import DONE_M, DONE_RAD, fitted
 from common import show, write_rows
 from mipsjax.app.compilation import enable_cache
 from mipsjax.config.sections import Config
+from mipsjax.core import evidence, least_squares, solvers
 from mipsjax.core import field as nf
-from mipsjax.core import solvers, tracking
 from mipsjax.core.camera import Intrinsics
-from mipsjax.core.rigid import distance, perturbed, transform
+from mipsjax.core.equations import Points
+from mipsjax.core.fit import draw_points
+from mipsjax.core.rigid import distance, perturbed
 from mipsjax.data.open import open_sequence
 
 OFFSET_M, OFFSET_RAD = 0.05, np.radians(5)
-SMALLEST = 1e-12  # square metres, under the root of the robust cost
 
 
 def with_optimistix(
-    field: nf.Field, T: jax.Array, points: solvers.Points, camera: Intrinsics, cfg: Config
+    field: nf.Field, T: jax.Array, points: Points, camera: Intrinsics, cfg: Config
 ) -> jax.Array:
-    """The robust cost of `levenberg_marquardt` as a sum of squares, solved by the library."""
+    sure = evidence.certainties(field, T, points, "whole", cfg)
 
-    def residuals(twist, _):
-        psi = nf.tsdf(field, transform(perturbed(T, twist), points.p_cam), cfg.field).psi
-        cost = solvers.robust_cost(psi, cfg.track.go.robust) + SMALLEST
-        return jnp.sqrt(solvers.precisions(points, cfg)) * jnp.sqrt(cost)
+    def rows(T):
+        return [evidence.map_rows(field, T, points, "whole", cfg, sure)]
 
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
-    found = optx.least_squares(
-        residuals,
-        solver,
-        jnp.zeros(6),
-        options={"jac": "fwd"},
-        max_steps=cfg.track.go.steps,
-        throw=False,
-    )
-    return perturbed(T, found.value)
+    return least_squares.solve(rows, T, cfg.track.go.steps, cfg.sensor.noise_floor)
 
 
-def with_ours(
-    field: nf.Field, T: jax.Array, points: solvers.Points, camera: Intrinsics, cfg: Config
-) -> jax.Array:
-    evidence = solvers.Evidence(points)
-    return solvers.levenberg_marquardt(field, T, evidence, "whole", cfg.track.go.steps, camera, cfg)
+def with_ours(field: nf.Field, T: jax.Array, points: Points, camera: Intrinsics, cfg: Config) -> jax.Array:
+    seen = evidence.Evidence(points)
+    return solvers.levenberg_marquardt(field, T, seen, "whole", cfg.track.go.steps, camera, cfg)
 
 
 def measured(
@@ -100,7 +86,7 @@ def main() -> None:
     for number in range(options.starts):
         place = int(rng.integers(len(sequence)))
         frame = sequence[place]
-        points = tracking.draw_points(
+        points = draw_points(
             jax.random.key(number), frame.depth, frame.color, cfg.track.go.pixels, sequence.intrinsics
         )
         v, w = (d / np.linalg.norm(d) * rng.random() for d in rng.standard_normal((2, 3)))

@@ -22,9 +22,9 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"loops"}),
     frozenset({"submaps"}),
     frozenset({"slam", "mesh"}),
-    frozenset({"metrics"}),
+    frozenset({"metrics", "viewer"}),
     frozenset({"app"}),
-    frozenset({"run", "evaluate"}),
+    frozenset({"run", "evaluate", "view"}),
 )
 LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
 

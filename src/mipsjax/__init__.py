@@ -24,10 +24,14 @@ if TYPE_CHECKING:
     from mipsjax.config.presets import PRESETS as PRESETS
     from mipsjax.config.presets import preset as preset
     from mipsjax.config.sections import Config as Config
+    from mipsjax.core.blend import Blended as Blended
+    from mipsjax.core.blend import add as blend  # noqa: F401
+    from mipsjax.core.blend import start as blend_of_none  # noqa: F401
     from mipsjax.core.camera import Intrinsics as Intrinsics
+    from mipsjax.core.draws import Frames as Frames
     from mipsjax.core.field import color as color
+    from mipsjax.core.field import init as init
     from mipsjax.core.field import tsdf as tsdf
-    from mipsjax.core.mapping import Frames as Frames
     from mipsjax.core.mapping import Learned as Learned
     from mipsjax.core.mapping import create as create
     from mipsjax.core.mapping import refine as refine
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
     from mipsjax.mesh.reconstruct import reconstruct as reconstruct_mesh  # noqa: F401
     from mipsjax.slam.finish import finish as finish
     from mipsjax.slam.info import FrameInfo as FrameInfo
+    from mipsjax.slam.localise import continued as continued
+    from mipsjax.slam.localise import localise as localise
     from mipsjax.slam.step import start as start
     from mipsjax.slam.step import step as step
     from mipsjax.submaps.saved import load as load
@@ -60,11 +66,12 @@ if TYPE_CHECKING:
 # and the module it is in.
 _PLACES = {
     "PRESETS": "config.presets:PRESETS",
+    "Blended": "core.blend:Blended",
     "Config": "config.sections:Config",
     "ConfigError": "errors:ConfigError",
     "FrameInfo": "slam.info:FrameInfo",
     "Frame": "data.sequence:Frame",
-    "Frames": "core.mapping:Frames",
+    "Frames": "core.draws:Frames",
     "InputError": "errors:InputError",
     "Learned": "core.mapping:Learned",
     "Intrinsics": "core.camera:Intrinsics",
@@ -76,11 +83,16 @@ _PLACES = {
     "Submap": "submaps.state:Submap",
     "TrackingLostError": "errors:TrackingLostError",
     "Views": "core.views:Views",
+    "blend": "core.blend:add",
+    "blend_of_none": "core.blend:start",
     "color": "core.field:color",
+    "continued": "slam.localise:continued",
     "create": "core.mapping:create",
     "tsdf": "core.field:tsdf",
     "fitness": "core.particles:fitness",
+    "init": "core.field:init",
     "load": "submaps.saved:load",
+    "localise": "slam.localise:localise",
     "open_sequence": "data.open:open_sequence",
     "preset": "config.presets:preset",
     "reconstruct_mesh": "mesh.reconstruct:reconstruct",

@@ -107,6 +107,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
     assert again.code == 0 and "this run has ended (done), its results are there" in again.stdout
 
 
+@pytest.mark.fault(42, 43)
 def test_a_killed_run_goes_on_to_the_same_bytes(
     program: Program, exported: Path, whole: Path, tmp_path: Path
 ) -> None:
@@ -147,6 +148,7 @@ def test_only_the_last_two_are_kept(cut: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["flipped", "truncated", "empty"])
+@pytest.mark.fault(43, 44)
 def test_where_the_last_one_is_damaged_the_one_before_it_serves(
     program: Program, cut: Path, whole: Path, how: str
 ) -> None:
@@ -167,6 +169,7 @@ def program_in(program: Program, folder: Path, *options: str) -> running.Result:
     return program.plain("--resume", str(folder), *options)
 
 
+@pytest.mark.fault(44)
 def test_where_all_are_damaged_nothing_is_made_of_them(program: Program, cut: Path) -> None:
     before = (cut / "trajectory.txt").read_bytes()
     for path in checkpoint.written(cut):
@@ -177,6 +180,7 @@ def test_where_all_are_damaged_nothing_is_made_of_them(program: Program, cut: Pa
     assert (cut / "trajectory.txt").read_bytes() == before
 
 
+@pytest.mark.fault(45)
 def test_another_version_is_refused(program: Program, cut: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint, "version", lambda _: "99.0")
@@ -192,6 +196,7 @@ def test_another_version_is_refused(program: Program, cut: Path, monkeypatch: py
     assert result.code == 3 and f"has version {earlier} of the format" in result.stderr
 
 
+@pytest.mark.fault(45)
 def test_another_configuration_is_refused(program: Program, cut: Path) -> None:
     path = cut / "config.json"
     content = json.loads(path.read_text())
@@ -201,6 +206,7 @@ def test_another_configuration_is_refused(program: Program, cut: Path) -> None:
     assert result.code == 3 and "another configuration" in result.stderr
 
 
+@pytest.mark.fault(45)
 def test_another_sequence_is_refused(program: Program, cut: Path, exported: Path, tmp_path: Path) -> None:
     other = shutil.copytree(exported, tmp_path / exported.name)
     last = image(other, "depth", -1)

@@ -36,6 +36,7 @@ def test_lies_in_the_users_cache(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system tells no usable cores")
+@pytest.mark.fault(55)
 def test_is_another_one_for_fewer_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a process that is held to one core compiles is not divided among several."""
     folders = []
@@ -62,6 +63,7 @@ def test_without_a_home_no_folder_is_made_here(tmp_path: Path, monkeypatch: pyte
     assert chosen() is None and not list(tmp_path.iterdir())
 
 
+@pytest.mark.fault(55)
 def test_is_done_without_where_there_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))

@@ -169,7 +169,8 @@ def test_files_are_readable_with_odd_numbers(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("call", range(WRITTEN))
-def test_47_full_disk_leaves_no_half_file(
+@pytest.mark.fault(47)
+def test_full_disk_leaves_no_half_file(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
 ) -> None:
     calls = []
@@ -198,9 +199,8 @@ def test_observed_points_are_those_of_the_scene(run: Run) -> None:
     assert len(points) and float(jnp.abs(distance).max()) < 5e-3 and float(jnp.abs(distance).mean()) < 2e-4
 
 
-def test_53_a_field_that_is_not_finite_gives_an_empty_mesh(
-    run: Run, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.mark.fault(53)
+def test_a_field_that_is_not_finite_gives_an_empty_mesh(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     assert run.state is not None
     learned = jax.tree.map(
         lambda leaf: leaf * jnp.nan if leaf.dtype == jnp.float32 else leaf, run.state.submap.learned

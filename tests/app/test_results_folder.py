@@ -15,6 +15,7 @@ from mipsjax.data.open import open_sequence
 from mipsjax.errors import OutputError
 
 
+@pytest.mark.fault(48)
 def test_numbered_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for expected in ("a", "a-2", "a-3"):
@@ -27,6 +28,7 @@ def test_numbered_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert choose_folder("a/b", None, None) == Path("runs/a-b")
 
 
+@pytest.mark.fault(49)
 def test_lock(tmp_path: Path) -> None:
     folder = tmp_path / "new"
     with claimed(folder):

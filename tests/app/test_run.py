@@ -25,7 +25,7 @@ program = running.program
 
 RESULTS = {
     "trajectory.txt", "trajectory_gt.txt", "mesh.ply", "mesh.png", "metrics.json", "config.json",
-    "status.csv", "events.jsonl", "loops.json",
+    "status.csv", "events.jsonl", "loops.json", "map",
 }  # fmt: skip
 
 PUBLIC = {
@@ -126,7 +126,8 @@ def test_order_of_preset_file_and_options(tmp_path: Path) -> None:
         (["s", "--layout", "zip"], "--layout"),
     ],
 )
-def test_51_wrong_options(program: Program, exported: Path, arguments: list[str], message: str) -> None:
+@pytest.mark.fault(51)
+def test_wrong_options(program: Program, exported: Path, arguments: list[str], message: str) -> None:
     result = program.plain(*(str(exported) if word == "s" else word for word in arguments))
     assert result.code == 2 and message in result.stderr and result.stdout == ""
 

@@ -25,6 +25,7 @@ while True:
 
 
 @pytest.mark.parametrize("number", signals.ENDING)
+@pytest.mark.fault(40, 41)
 def test_a_signal_while_the_program_is_loaded_ends_it_with_one_line(number: signal.Signals) -> None:
     environment = os.environ | {"PYTHONPATH": str(Path(mipsjax.__file__).parents[1])}
     script = ASLEEP + LISTENING + SWALLOWING

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mipsjax.core import mapping
+from mipsjax.core import draws, mapping
 
 FIT_STEPS = 600
 
 
 @pytest.fixture(scope="session")
-def corner_frames() -> mapping.Frames:
+def corner_frames() -> draws.Frames:
     """The corner from five true poses, of which all but the first may move."""
     depth, color = zip(*(corner.see(T) for T in corner.VIEWS), strict=True)
-    return mapping.Frames(
+    return draws.Frames(
         np.stack(depth), np.stack(color), corner.VIEWS.astype(np.float32), np.arange(len(corner.VIEWS)) > 0
     )
 

@@ -12,7 +12,7 @@ import pytest
 from corner import CAMERA, CFG, VIEWS, apart, pose
 
 from compilations import compilations
-from mipsjax.core import mapping
+from mipsjax.core import draws, mapping
 
 KEY = jax.random.key(2)
 
@@ -39,7 +39,7 @@ def loss():
 
 
 @pytest.fixture(scope="module")
-def jolted(corner_frames) -> mapping.Frames:
+def jolted(corner_frames) -> draws.Frames:
     """The movable frames 1 cm and half a degree off, each in another direction."""
     jolts = [
         pose(),
@@ -64,8 +64,8 @@ def test_the_gradient_does_not_depend_on_the_chunks(fresh, corner_frames, monkey
         return jax.jit(lambda field: mapping.map_loss(field, corner_frames, KEY, CAMERA, CFG))(fresh.field)
 
     whole = gradient()
-    monkeypatch.setattr(mapping, "CHUNK_SAMPLES", 300)
-    assert mapping.draw(fresh.field, corner_frames, KEY, CAMERA, CFG).frame.shape[0] > 5
+    monkeypatch.setattr(draws, "CHUNK_SAMPLES", 300)
+    assert draws.draw(fresh.field, corner_frames, KEY, CAMERA, CFG).frame.shape[0] > 5
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(gradient()), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
 
@@ -75,11 +75,11 @@ def test_samples_around_the_surface_do_not_depend_on_the_chunks(fresh, corner_fr
     frames = jax.tree.map(jnp.asarray, corner_frames)
 
     def depth():
-        drawn = mapping.draw(fresh.field, frames, KEY, CAMERA, cfg).samples.depth
+        drawn = draws.draw(fresh.field, frames, KEY, CAMERA, cfg).samples.depth
         return np.asarray(drawn).reshape(-1, drawn.shape[-1])
 
     whole = depth()
-    monkeypatch.setattr(mapping, "CHUNK_SAMPLES", 300)
+    monkeypatch.setattr(draws, "CHUNK_SAMPLES", 300)
     same = np.isclose(depth(), whole, rtol=0, atol=1e-6).all(1)
     # Of two samples with about the same distance, rounding may choose the other
     assert same.mean() > 0.98
@@ -135,7 +135,7 @@ def test_no_steps_change_nothing(corner_map, jolted):
     assert same_bits(after, corner_map) and same_bits(poses, jolted.T_sub_cam) and bool(info.ok)
 
 
-def spoil(frames: mapping.Frames, where: str) -> mapping.Frames:
+def spoil(frames: draws.Frames, where: str) -> draws.Frames:
     broken = np.array(getattr(frames, where))
     broken[2] = np.nan
     return frames._replace(**{where: broken})
@@ -176,7 +176,7 @@ def test_the_slope_of_the_surface_in_closed_form():
     near_edge = np.sort(np.abs(hit - corner.WALLS), 1)[:, 1] < 0.2
     wall = np.abs(hit - corner.WALLS).argmin(1)
     expected = np.abs((corner.rays(v, u) @ turn[:3, :3].T)[np.arange(len(u)), wall])
-    slope = np.asarray(mapping.surface_slope(depth, v, u, CAMERA, CFG))
+    slope = np.asarray(draws.surface_slope(depth, v, u, CAMERA, CFG))
     plain = ~near_edge & (expected > 0.3)
     assert plain.sum() > 50
     # Differences of a float32 depth over 4 pixels, 7 cm apart at 2 m: 1e-6 / 0.07 of the slope
@@ -185,7 +185,7 @@ def test_the_slope_of_the_surface_in_closed_form():
 
 def test_pixels_are_drawn_from_where_they_say(corner_frames):
     cfg = replace(CFG, sample=replace(CFG.sample, perpendicular=True))
-    drawn = mapping.draw_pixels(KEY, corner_frames.depth[0], corner_frames.color[0], CAMERA, cfg)
+    drawn = draws.draw_pixels(KEY, corner_frames.depth[0], corner_frames.color[0], CAMERA, cfg)
     u = np.rint(np.asarray(drawn.ray[:, 0]) * CAMERA.fx + CAMERA.cx).astype(int)
     v = np.rint(np.asarray(drawn.ray[:, 1]) * CAMERA.fy + CAMERA.cy).astype(int)
     np.testing.assert_array_equal(drawn.depth, corner_frames.depth[0][v, u])

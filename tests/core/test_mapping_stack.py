@@ -17,7 +17,7 @@ import pytest
 
 from mipsjax.app.compilation import enable_cache
 from mipsjax.config.presets import PRESETS
-from mipsjax.core import mapping
+from mipsjax.core import draws, mapping
 from mipsjax.core.camera import Intrinsics
 
 pytestmark = pytest.mark.slow
@@ -30,14 +30,14 @@ RATES = jnp.linspace(0.25, 1.0, SUBMAPS)
 Refined = tuple[mapping.Learned, jax.Array, mapping.MapInfo]
 
 
-def walls(seed: int) -> mapping.Frames:
+def walls(seed: int) -> draws.Frames:
     """Five frames of a slanted wall, another for each seed."""
     rng = np.random.default_rng(seed)
     depth = np.linspace(1.5, 2.0 + rng.random(), CAMERA.width, dtype=np.float32)
     color = rng.integers(0, 255, (5, CAMERA.height, CAMERA.width, 3), np.uint8)
     poses = np.broadcast_to(np.eye(4, dtype=np.float32), (5, 4, 4))
     depths = np.broadcast_to(depth, (5, CAMERA.height, CAMERA.width))
-    return mapping.Frames(*map(jnp.asarray, (depths, color, poses, np.zeros(5, np.float32))))
+    return draws.Frames(*map(jnp.asarray, (depths, color, poses, np.zeros(5, np.float32))))
 
 
 def stacked():

@@ -174,6 +174,7 @@ def test_a_step_never_worsens_the_centre(wall, fitness, step, delta):
     assert costs[-1] < 0.003**2
 
 
+@pytest.mark.fault(35)
 def test_an_empty_advantage_set_keeps_the_centre_and_changes_the_radii(wall, step):
     swarm = Swarm(jnp.asarray(off_by((0, 0, 0, 0, 0, 0.05))), jnp.float32(jnp.inf), jnp.asarray(RADII))
     after = step(swarm, np.zeros((COUNT, 6), np.float32), wall)  # every particle is the centre
@@ -182,6 +183,7 @@ def test_an_empty_advantage_set_keeps_the_centre_and_changes_the_radii(wall, ste
     assert (np.abs(ratio - 1) > 0.05).all() and (after.radii > 0).all()
 
 
+@pytest.mark.fault(35)
 def test_costs_that_are_not_numbers_leave_the_centre(wall, step):
     swarm = Swarm(jnp.asarray(off_by((0, 0, 0, 0, 0, 0.05))), jnp.float32(jnp.inf), jnp.asarray(RADII))
     broken = jax.tree.map(lambda a: jnp.full_like(a, jnp.nan), wall)

@@ -10,6 +10,7 @@ import pytest
 from mipsjax.config.sections import Config
 from mipsjax.core.camera import project, rays
 from mipsjax.core.equations import Points, System, descend
+from mipsjax.core.evidence import Evidence
 from mipsjax.core.photometric import (
     EDGE_PX,
     FEWEST,
@@ -21,7 +22,7 @@ from mipsjax.core.photometric import (
     pyramid,
     with_noise,
 )
-from mipsjax.core.solvers import Evidence, approach
+from mipsjax.core.solvers import approach
 from mipsjax.core.views import Views
 from painted import CAMERA, painting, pose, wall
 

@@ -16,8 +16,8 @@ import painted
 from mipsjax.config.sections import Config, PairConfig
 from mipsjax.core import relative
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.evidence import Landmarks
 from mipsjax.core.photometric import Images
-from mipsjax.core.solvers import Landmarks
 from mipsjax.uncertainty.trust import ALLOWED, of_pair
 
 CFG = replace(Config(), pairs=PairConfig(pixels=2304))

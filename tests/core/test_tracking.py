@@ -14,8 +14,9 @@ from corner import ADAM, CAMERA, CFG, HOME, WALLS, apart, pose, see, unprojected
 from planes import CFG as PLANE_CFG
 from planes import plane
 
-from mipsjax.core import equations, losses, solvers, tracking
+from mipsjax.core import equations, evidence, information, losses, solvers, tracking
 from mipsjax.core import field as nf
+from mipsjax.core.fit import draw_points, measure_fit
 from mipsjax.core.photometric import Images
 from mipsjax.core.rigid import transform
 from mipsjax.core.views import Views, own_normals
@@ -43,9 +44,9 @@ def frame() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def points(frame) -> solvers.Points:
+def points(frame) -> equations.Points:
     depth, color = frame
-    return tracking.draw_points(KEY, depth, color, CFG.track.go.pixels, CAMERA)
+    return draw_points(KEY, depth, color, CFG.track.go.pixels, CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def lm(corner_map, points):
     one = partial(
         solvers.levenberg_marquardt,
         corner_map.field,
-        seen=solvers.Evidence(points),
+        seen=evidence.Evidence(points),
         part="whole",
         steps=CFG.track.go.steps,
         camera=CAMERA,
@@ -80,13 +81,13 @@ def test_points_are_those_of_the_depth_image(points, frame):
 def test_pixels_without_depth_are_masked(frame):
     depth, color = frame
     depth = np.where(np.arange(CAMERA.width)[None] < 40, np.float32(0), depth)
-    drawn = tracking.draw_points(KEY, depth, color, 300, CAMERA)
+    drawn = draw_points(KEY, depth, color, 300, CAMERA)
     assert 0.6 < np.mean(drawn.mask) < 0.8  # 88 of 128 columns
     np.testing.assert_array_equal(drawn.mask, drawn.p_cam[:, 2] > 0)
 
 
 def test_the_map_is_accurate_enough_for_these_tests(corner_map, points):
-    fit = tracking.measure_fit(corner_map.field, jnp.asarray(TRUTH, jnp.float32), points, "whole", CFG)
+    fit = measure_fit(corner_map.field, jnp.asarray(TRUTH, jnp.float32), points, "whole", CFG)
     assert float(fit.residual) < 0.01 and float(fit.known) > 0.95
 
 
@@ -104,18 +105,18 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
 
     @jax.jit
     def derivatives(twist):
-        precision = solvers.precisions(points, cfg)
+        precision = equations.precisions(points, cfg)
         # A saturated point costs, but is not to pull
-        pulls = jnp.abs(psi(twist)) < solvers.SATURATED * CFG.field.truncation
+        pulls = jnp.abs(psi(twist)) < evidence.SATURATED * CFG.field.truncation
 
         def costs(xi):
-            return precision * solvers.robust_cost(psi(xi), cfg.track.go.robust)
+            return precision * equations.robust_cost(psi(xi), cfg.track.go.robust)
 
         gradient = jax.grad(lambda xi: jnp.sum(pulls * costs(xi)))(twist)
         weight = precision * pulls / (1 + (psi(twist) / cfg.track.go.robust) ** 2)
         rows = jax.jacfwd(psi)(twist)
-        expected = solvers.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
-        return solvers.map_rows(corner_map.field, T, points, part, cfg).system(), expected
+        expected = equations.System(jnp.sum(costs(twist)), rows.T * weight[None] @ rows, gradient / 2)
+        return evidence.map_rows(corner_map.field, T, points, part, cfg).system(), expected
 
     for found, expected in zip(*derivatives(jnp.zeros(6)), strict=True):
         # Sums of 768 float32 numbers in another order, of which those of the slope partly cancel
@@ -124,16 +125,16 @@ def test_the_normal_equations_against_automatic_derivatives(corner_map, points, 
 
 def test_points_count_by_the_noise_of_their_depth():
     z = jnp.array([0.5, 1.0, 2.0, 4.0, 0.0])
-    points = solvers.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
-    found = np.asarray(solvers.precisions(points, CFG))
+    points = equations.Points(jnp.stack([z, z, z], -1), jnp.zeros((5, 3)), z > 0)
+    found = np.asarray(equations.precisions(points, CFG))
     assert found[-1] == 0 and found[:4].mean() == pytest.approx(1)
     noise = CFG.sensor.noise_growth * np.asarray(z[:4]) ** 2
     variance = CFG.sensor.noise_floor**2 + noise**2
     np.testing.assert_allclose(found[:4] * variance, found[0] * variance[0], rtol=1e-5)
     even = replace(CFG, sensor=replace(CFG.sensor, noise_growth=0.0))
-    np.testing.assert_allclose(solvers.precisions(points, even), points.mask)
+    np.testing.assert_allclose(equations.precisions(points, even), points.mask)
     nothing = points._replace(mask=jnp.zeros(5, bool))
-    np.testing.assert_array_equal(solvers.precisions(nothing, CFG), 0)
+    np.testing.assert_array_equal(equations.precisions(nothing, CFG), 0)
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -181,7 +182,7 @@ def test_the_first_candidate_is_left_for_one_that_fits_clearly_better(
     """Metres along the view. Shares keep off `track.rest`: `track` draws other points than these."""
     first, other = (TRUTH @ pose((0, 0, 0), (0, 0, d)) for d in (0.1, metres))
     misfit, misfit_other = (
-        tracking.measure_fit(corner_map.field, jnp.asarray(T, jnp.float32), points, "search", CFG).residual
+        measure_fit(corner_map.field, jnp.asarray(T, jnp.float32), points, "search", CFG).residual
         for T in (first, other)
     )
     assert share[0] < misfit_other / misfit < share[1]
@@ -205,13 +206,14 @@ def test_the_search_recovers_what_lm_alone_does_not(corner_map, frame, lm, offse
 def test_adam_converges_from_a_small_offset(corner_map, points):
     """The paper's optimiser on d2t and colour; with steps of 1 cm and 0.57 degrees it ends near the truth."""
     start = TRUTH @ pose((0.5, -0.5, 0.3), (0.01, -0.005, 0.01))
-    run = jax.jit(partial(solvers.adam, corner_map.field, points=points, key=KEY, cfg=ADAM))
+    run = jax.jit(partial(solvers.adam, corner_map.field, points=points, trust=1.0, key=KEY, cfg=ADAM))
     T = np.asarray(run(start.astype(np.float32)))
     before, after = apart(start, TRUTH), apart(T, TRUTH)
     assert after[0] < 0.5 * before[0] and after[1] < 0.7 * before[1]
     assert after[0] < 0.005
 
 
+@pytest.mark.fault(35, 36)
 def test_a_broken_map_leaves_the_candidate(corner_map, frame):
     broken = jax.tree.map(lambda a: jnp.full_like(a, jnp.nan), corner_map.field)
     start = (TRUTH @ NEAR).astype(np.float32)
@@ -237,10 +239,10 @@ def test_tracking_is_deterministic(corner_map, frame):
 def test_what_is_known_and_what_is_only_not_contradicted(corner_map, points):
     """Far away the field may say anything, but is certain of nothing."""
     T = jnp.asarray(TRUTH, jnp.float32)
-    here = tracking.measure_fit(corner_map.field, T, points, "whole", CFG)
+    here = measure_fit(corner_map.field, T, points, "whole", CFG)
     assert here.known > 0.95 and 0.5 < here.confirmed <= here.known
     elsewhere = T.at[:3, 3].add(jnp.array([30.0, 40.0, 50.0]))
-    there = tracking.measure_fit(corner_map.field, elsewhere, points, "whole", CFG)
+    there = measure_fit(corner_map.field, elsewhere, points, "whole", CFG)
     assert there.confirmed < CFG.guard.confirmed < here.confirmed
 
 
@@ -275,12 +277,12 @@ def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
 
     views = Views(jnp.asarray(np.stack([noisy()] * 2)), jnp.tile(jnp.eye(4), (2, 1, 1)))
     depth = noisy()
-    seen = tracking.draw_points(KEY, depth, np.zeros((*frame[0].shape, 3), np.uint8), 2304, CAMERA)
+    seen = draw_points(KEY, depth, np.zeros((*frame[0].shape, 3), np.uint8), 2304, CAMERA)
     p_sub = np.asarray(seen.p_cam)
-    evidence = solvers.Evidence(seen, views, landmarks_of(np.eye(4), p_sub))
+    seen_by = evidence.Evidence(seen, views, landmarks_of(np.eye(4), p_sub))
     T = jnp.eye(4)
     normals = own_normals(jnp.asarray(depth), seen.p_cam, CAMERA, PLANE_CFG.sensor.noise_growth)
-    found = jax.jit(lambda: solvers.information(wall, T, evidence, normals, CAMERA, PLANE_CFG))()
+    found = jax.jit(lambda: information.information(wall, T, seen_by, normals, CAMERA, PLANE_CFG))()
     surfaces, corners = (
         np.asarray(part) * PLANE_CFG.sensor.noise_floor**2 for part in (found.surfaces, found.corners)
     )
@@ -288,8 +290,8 @@ def test_a_bare_wall_leaves_a_frame_free_whatever_noise_says(frame):
     surfaces = surfaces / float(losses.precision(jnp.float32(2.0), PLANE_CFG.sensor))
     normals = jax.jit(
         lambda: (
-            solvers.map_rows(wall, T, seen, "whole", PLANE_CFG).system().hessian
-            + solvers.view_rows(T, seen, views, CAMERA, PLANE_CFG).system().hessian
+            evidence.map_rows(wall, T, seen, "whole", PLANE_CFG).system().hessian
+            + evidence.view_rows(T, seen, views, CAMERA, PLANE_CFG).system().hessian
         )
     )()
     # Two shifts along the wall and a turn about its normal are free
@@ -310,12 +312,12 @@ def test_bumps_that_were_learned_hold_nothing_and_what_is_there_does(roof):
 
     def hessian(frame, map_, own):
         depth, views = jnp.asarray(frame, jnp.float32), jnp.asarray(map_, jnp.float32)[None]
-        points = tracking.draw_points(KEY, depth, np.zeros((*exact.shape, 3), np.uint8), 2304, CAMERA)
-        rows = solvers.view_rows(jnp.eye(4), points, Views(views, jnp.eye(4)[None]), CAMERA, PLANE_CFG)
+        points = draw_points(KEY, depth, np.zeros((*exact.shape, 3), np.uint8), 2304, CAMERA)
+        rows = evidence.view_rows(jnp.eye(4), points, Views(views, jnp.eye(4)[None]), CAMERA, PLANE_CFG)
         if not own:
             return np.asarray(rows.system().hessian)
         normals = own_normals(depth, points.p_cam, CAMERA, PLANE_CFG.sensor.noise_growth)
-        return np.asarray(solvers.steady_hessian([rows], points, normals))
+        return np.asarray(information.steady_hessian([rows], points, normals))
 
     true, as_it_is, steady = (
         hessian(exact, exact, False),
@@ -348,9 +350,9 @@ def test_the_motion_prior_counts_where_nothing_else_holds_a_frame(corner_map, po
 
     def end(points):
         weak = (CFG.sensor.noise_floor / CFG.track.prior) ** 2 * jnp.eye(6)
-        evidence = solvers.Evidence(points, prior=equations.Prior(away, weak))
+        seen_by = evidence.Evidence(points, prior=equations.Prior(away, weak))
         start = jnp.asarray(TRUTH, jnp.float32)
-        return solvers.levenberg_marquardt(corner_map.field, start, evidence, "whole", 10, CAMERA, CFG)
+        return solvers.levenberg_marquardt(corner_map.field, start, seen_by, "whole", 10, CAMERA, CFG)
 
     nothing = points._replace(mask=jnp.zeros_like(points.mask))
     assert apart(end(nothing), away)[0] < 1e-4 and apart(end(points), TRUTH)[0] < TOLERANCE_M
@@ -405,19 +407,19 @@ def test_a_frame_without_colour_is_tracked_as_if_colour_were_not_wanted(corner_m
 
 def test_the_robust_cost():
     psi = np.linspace(-0.1, 0.1, 11)
-    cost = np.asarray(solvers.robust_cost(jnp.asarray(psi), 0.02))
+    cost = np.asarray(equations.robust_cost(jnp.asarray(psi), 0.02))
     np.testing.assert_allclose(cost, 0.02**2 * np.log1p((psi / 0.02) ** 2), rtol=1e-5)
     assert (cost <= psi**2 + 1e-9).all() and (np.diff(cost[5:]) > 0).all()
 
 
-def landmarks_of(T_sub_cam, p_sub, noise=0.0, axes=None) -> solvers.Landmarks:
+def landmarks_of(T_sub_cam, p_sub, noise=0.0, axes=None) -> evidence.Landmarks:
     """Where points of the submap are seen from a pose; those behind the camera are fillers."""
     p_cam = np.asarray(transform(jnp.asarray(np.linalg.inv(T_sub_cam), jnp.float32), p_sub))
     mask = p_cam[:, 2] > 0.1
     ray = p_cam[:, :2] / np.where(mask, p_cam[:, 2], 1)[:, None]
     ray = ray + noise * np.random.default_rng(0).normal(size=ray.shape)
     axes = jnp.asarray(np.tile(np.eye(2), (len(mask), 1, 1)) if axes is None else axes, jnp.float32)
-    return solvers.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), axes, jnp.asarray(mask))
+    return evidence.Landmarks(jnp.asarray(p_sub), jnp.asarray(ray, jnp.float32), axes, jnp.asarray(mask))
 
 
 def test_the_equations_of_landmarks_against_automatic_derivatives(points):
@@ -427,9 +429,9 @@ def test_the_equations_of_landmarks_against_automatic_derivatives(points):
 
     def cost(twist):
         moved = T @ jaxlie.SE3.exp(twist).as_matrix()
-        return solvers.landmark_system(moved, landmarks, CAMERA, CFG).cost
+        return evidence.landmark_system(moved, landmarks, CAMERA, CFG).cost
 
-    found = jax.jit(lambda: solvers.landmark_system(T, landmarks, CAMERA, CFG))()
+    found = jax.jit(lambda: evidence.landmark_system(T, landmarks, CAMERA, CFG))()
     expected = jax.jit(jax.grad(cost))(jnp.zeros(6)) / 2
     np.testing.assert_allclose(found.slope, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     # Positive definite: points of three walls leave no direction free
@@ -440,13 +442,13 @@ def test_landmarks_hold_what_surfaces_leave_free():
     """In front of one wall the camera slides; points painted on it say where it is."""
     wall = plane((0, 0, -1), -2.0, cfg=PLANE_CFG)
     depth = np.full((CAMERA.height, CAMERA.width), 2, np.float32)
-    seen = tracking.draw_points(KEY, depth, np.zeros((*depth.shape, 3), np.uint8), 300, CAMERA)
+    seen = draw_points(KEY, depth, np.zeros((*depth.shape, 3), np.uint8), 300, CAMERA)
     landmarks = landmarks_of(np.eye(4), np.asarray(seen.p_cam))
     start = jnp.asarray(pose((0, 0, 3), (0.03, -0.02, 0)), jnp.float32)
 
     def end(landmarks):
-        evidence = solvers.Evidence(seen, landmarks=landmarks)
-        return solvers.levenberg_marquardt(wall, start, evidence, "whole", 10, CAMERA, PLANE_CFG)
+        seen_by = evidence.Evidence(seen, landmarks=landmarks)
+        return solvers.levenberg_marquardt(wall, start, seen_by, "whole", 10, CAMERA, PLANE_CFG)
 
     without, held = apart(end(None), np.eye(4)), apart(end(landmarks), np.eye(4))
     assert without[0] > 0.03 and without[1] > 2.5

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from corner import CAMERA, CFG, HOME, VIEWS, WALLS, apart, pose, see, unprojected
 
+from mipsjax.core import evidence, solvers
 from mipsjax.core import field as nf
-from mipsjax.core import solvers, tracking
 from mipsjax.core.camera import Intrinsics, rays
+from mipsjax.core.fit import draw_points
 from mipsjax.core.views import Views, observed, own_normals, plane_errors, planes_at
 
 KEY = jax.random.key(11)
@@ -125,7 +126,7 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
     cfg = replace(CFG, track=replace(CFG.track, go=replace(CFG.track.go, view_weight=1.0)))
     field = nf.init(KEY, cfg.field)
     depth, color = see(TRUTH)
-    points = tracking.draw_points(KEY, depth, color, cfg.track.go.pixels, CAMERA)
+    points = draw_points(KEY, depth, color, cfg.track.go.pixels, CAMERA)
     start = (TRUTH @ pose((1.2, -1.2, 1.0), (0.012, -0.012, 0.01))).astype(np.float32)
 
     @jax.jit
@@ -133,7 +134,7 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
         return solvers.levenberg_marquardt(
             field,
             jnp.asarray(start),
-            solvers.Evidence(points, given),
+            evidence.Evidence(points, given),
             "whole",
             cfg.track.go.steps,
             CAMERA,
@@ -148,11 +149,11 @@ def test_views_alone_hold_a_pose_that_the_map_does_not_know(views):
 
 def test_points_say_as_much_as_their_precision(views, monkeypatch):
     """To the map and to the views alike: without any, nothing moves the pose."""
-    monkeypatch.setattr(solvers, "precisions", lambda points, cfg: 0.0 * points.mask)
-    points = tracking.draw_points(KEY, *see(TRUTH), CFG.track.go.pixels, CAMERA)
+    monkeypatch.setattr(evidence, "precisions", lambda points, cfg: 0.0 * points.mask)
+    points = draw_points(KEY, *see(TRUTH), CFG.track.go.pixels, CAMERA)
     start = jnp.asarray(TRUTH @ pose((0, 0, 0), (0.01, 0, 0)), jnp.float32)
     field, steps = nf.init(KEY, CFG.field), CFG.track.go.steps
     end = solvers.levenberg_marquardt(
-        field, start, solvers.Evidence(points, views), "whole", steps, CAMERA, CFG
+        field, start, evidence.Evidence(points, views), "whole", steps, CAMERA, CFG
     )
     np.testing.assert_array_equal(end, start)

@@ -91,6 +91,7 @@ def test_camera_file_fills_what_options_leave_open(tmp_path: Path) -> None:
     assert with_camera_file(Options(), tmp_path).depth_scale == DepthScale(7.0, "camera.json")
 
 
+@pytest.mark.fault(20)
 def test_frame_rate() -> None:
     assert frame_rate(Options(fps=60.0)) == (60.0, ())
     assert frame_rate(Options()) == (30.0, ("no times known: frames taken to be 1/30 s apart",))

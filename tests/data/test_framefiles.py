@@ -29,6 +29,7 @@ def paths(*names: str) -> list[Path]:
     return [Path(name) for name in names]
 
 
+@pytest.mark.fault(25)
 def test_numeric_order_not_lexical() -> None:
     found, files = pair_by_name(
         paths("10.jpg", "2.jpg", "1.jpg"), paths("000001.png", "10.png"), lambda p: p.stem
@@ -52,6 +53,7 @@ def test_numbers_of_frames(names: tuple[str, ...], numbers: list[int] | None) ->
     assert frame_numbers(keys(*names)) == numbers
 
 
+@pytest.mark.fault(20)
 def test_times_follow_the_numbers() -> None:
     np.testing.assert_allclose(numbered_times(keys("3", "4", "7"), 30.0), np.array([0, 1, 4]) / 30)
     np.testing.assert_allclose(numbered_times(keys("a", "b"), 30.0), np.array([0, 1]) / 30)

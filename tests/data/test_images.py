@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -79,6 +80,7 @@ def test_a_folder_in_place_of_an_image(tmp_path: Path) -> None:
 
 
 @given(cut=st.floats(0, 0.999))
+@pytest.mark.fault(7)
 def test_any_truncated_png_is_damaged(cut: float) -> None:
     data = cv2.imencode(".png", depth_image(0))[1].tobytes()
     assert find_damage(data) == ""
@@ -87,6 +89,7 @@ def test_any_truncated_png_is_damaged(cut: float) -> None:
 
 
 @given(place=st.integers(8, 10_000), bit=st.integers(0, 7))
+@pytest.mark.fault(8)
 def test_any_flipped_bit_of_a_png_is_damage(place: int, bit: int) -> None:
     data = bytearray(cv2.imencode(".png", depth_image(0))[1].tobytes())
     data[8 + place % (len(data) - 8)] ^= 1 << bit
@@ -103,11 +106,24 @@ def test_damaged_png_is_no_depth(depth_png: Path, capfd: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
+@pytest.mark.fault(9)
 def test_truncated_jpeg_is_found(color_jpg: Path, part: float) -> None:
     data = color_jpg.read_bytes()
     color_jpg.write_bytes(data[: int(part * len(data))])
     color, reason = read_color(color_jpg)
     assert color is None and reason == "unreadable_color: color.jpg: truncated JPEG"
+
+
+def test_nothing_is_printed_of_a_damaged_jpeg(color_jpg: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(color_jpg.read_bytes())
+    scan = data.index(b"\xff\xda")
+    # No marker, so that it is found only when it is decoded
+    data[scan + 20 : scan + 60] = bytes(range(40))
+    color_jpg.write_bytes(bytes(data))
+    color, _ = read_color(color_jpg)
+    assert color is not None and capfd.readouterr().err == ""
+    print("after", file=sys.stderr)
+    assert capfd.readouterr().err == "after\n"
 
 
 def test_jpeg_thumbnail_does_not_hide_truncation(color_jpg: Path) -> None:
@@ -157,6 +173,7 @@ def test_any_bytes_have_a_header_or_none(data: bytes, start: bytes) -> None:
     assert isinstance(find_damage(start + data), str)
 
 
+@pytest.mark.fault(16)
 def test_invalid_depth_becomes_zero() -> None:
     metres = np.array([[np.nan, np.inf, -np.inf, -1.0, 0.0, 0.05, 9.0, 2.5]], np.float32)
     np.testing.assert_array_equal(
@@ -164,6 +181,7 @@ def test_invalid_depth_becomes_zero() -> None:
     )
 
 
+@pytest.mark.fault(17)
 def test_sensor_codes_are_no_depth_at_any_scale() -> None:
     raw = np.array([[0, 65535, 65534]], np.uint16)
     np.testing.assert_array_equal(depth_to_metres(raw, 65534.0, 0.0, np.inf), [[0, 0, 1]])

@@ -106,6 +106,7 @@ def test_current_folder_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert open_sequence(".").name == "kitchen"
 
 
+@pytest.mark.fault(1)
 def test_missing_path(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         open_sequence(tmp_path / "no" / "such")
@@ -125,6 +126,7 @@ def test_empty_folder(tmp_path: Path) -> None:
     assert all(name in str(error.value) for name in LAYOUTS)
 
 
+@pytest.mark.fault(2)
 def test_unknown_layout_shows_ten_names(tmp_path: Path) -> None:
     for number in range(12):
         (tmp_path / f"file{number:02d}").touch()
@@ -138,6 +140,7 @@ def test_sequence_one_level_down(tmp_path: Path) -> None:
         open_sequence(tmp_path)
 
 
+@pytest.mark.fault(3)
 def test_two_layouts(tmp_path: Path) -> None:
     write_tum(write_folder(tmp_path / "both"))
     with pytest.raises(InputError, match="looks like folder and tum; choose with --layout"):
@@ -206,6 +209,7 @@ def test_depth_scale_that_cannot_be(tmp_path: Path, scale: float, median: str) -
     assert str(error.value).endswith("pass --depth-scale (units per metre); 1000 would make it 2 m")
 
 
+@pytest.mark.fault(18)
 def test_unusual_depth_is_remarked_on(tmp_path: Path) -> None:
     root = write_folder(tmp_path / "kitchen")
     notes = open_sequence(root, depth_scale=100.0).notes
@@ -284,6 +288,7 @@ def test_depth_beyond_the_configured_range_does_not_hide_the_scale(tmp_path: Pat
     assert any("is 20 m" in note for note in open_sequence(root, input=InputConfig(depth_max=8.0)).notes)
 
 
+@pytest.mark.fault(19)
 def test_wrong_intrinsics(tmp_path: Path) -> None:
     root = write_folder(tmp_path / "kitchen")
     (root / "camera.json").write_text(json.dumps(CAMERA | {"fy": -480.0}))

@@ -115,6 +115,7 @@ def test_camera_file_leaves_times_alone(root: Path) -> None:
     np.testing.assert_allclose(tum.read(root, Options()).timestamps, 100 + np.arange(FRAMES) / 10)
 
 
+@pytest.mark.fault(21, 22)
 def test_unsorted_and_repeated_rows(root: Path) -> None:
     lines = (root / "depth.txt").read_text().splitlines()
     (root / "depth.txt").write_text("\n".join([*reversed(lines), lines[2]]))
@@ -124,6 +125,7 @@ def test_unsorted_and_repeated_rows(root: Path) -> None:
     assert "depth.txt: 1 entries with a repeated timestamp dropped" in sequence.notes
 
 
+@pytest.mark.fault(23)
 def test_another_clock(root: Path) -> None:
     lines = (root / "rgb.txt").read_text().replace("\n", "\n1").splitlines()[1:-1]
     (root / "rgb.txt").write_text("\n".join(lines))

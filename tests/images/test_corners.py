@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mipsjax.core.rigid import from_twist, to_twist, transform
-from mipsjax.images.corners import EDGE_PX, Corners, corners, follow
+from mipsjax.images.corners import EDGE_PX, Corners, corners
+from mipsjax.images.following import follow
 from painted import CAMERA, FINE_PX_PER_M, RANGE_M, painting, pose, wall
 
 COUNT, FEWEST = 400, 30

@@ -288,7 +288,8 @@ def test_a_loop_removes_its_error_among_false_ones_too(submaps, edge, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_37_five_false_loops_of_twelve(seed):
+@pytest.mark.fault(37)
+def test_five_false_loops_of_twelve(seed):
     rng = np.random.default_rng(seed)
     truth = np.concatenate([ring(10), ring(10)])  # two rounds
     start, chain = chained(truth, rng, 0.1, 0.03)
@@ -374,7 +375,8 @@ def test_a_trusted_factor_is_never_rejected():
     assert solve(start, [*chain, false._replace(trusted=True)]).weights[-1] == 1
 
 
-def test_38_every_connected_part_keeps_its_lowest_submap():
+@pytest.mark.fault(38)
+def test_every_connected_part_keeps_its_lowest_submap():
     rng = np.random.default_rng(14)
     truth = np.stack([random_pose(rng) for _ in range(7)])
     start = np.stack([T @ noise(rng, 0.1, 0.05) for T in truth])
@@ -390,7 +392,8 @@ def test_38_every_connected_part_keeps_its_lowest_submap():
         assert_same_poses(relative(found.T_world_sub, *f[:2]), f.T_first_second, CONVERGED)
 
 
-def test_38_no_system_without_an_anchor_is_solved(monkeypatch):
+@pytest.mark.fault(38)
+def test_no_system_without_an_anchor_is_solved(monkeypatch):
     """Sequential edges in two parts, a true loop and a false one between them, a submap apart."""
     rng = np.random.default_rng(20)
     truth = np.stack([random_pose(rng) for _ in range(6)])
@@ -412,7 +415,8 @@ def test_38_no_system_without_an_anchor_is_solved(monkeypatch):
     assert len(weakest) > 3 and min(weakest) > 1
 
 
-def test_38_a_part_that_hung_on_a_false_loop_stays():
+@pytest.mark.fault(38)
+def test_a_part_that_hung_on_a_false_loop_stays():
     rng = np.random.default_rng(15)
     truth = ring(6)
     start, chain = chained(truth, rng, 0.05, 0.02)
@@ -474,7 +478,8 @@ HOLED = np.where(np.eye(20, 3) > 0, np.nan, GOOD_PLANES.p_first)
         GOOD_PLANES._replace(p_first=np.zeros((0, 3)), n_first=np.zeros((0, 3)), q_second=np.zeros((0, 3))),
     ],
 )
-def test_39_a_bad_factor_is_refused_by_the_names_of_its_submaps(bad):
+@pytest.mark.fault(39)
+def test_a_bad_factor_is_refused_by_the_names_of_its_submaps(bad):
     with pytest.raises(FactorError, match="between submaps 2 and 1") as raised:
         solve(ring(4), [bad])
     assert raised.value.pair == (2, 1)
@@ -532,6 +537,7 @@ def moved_apart(graph, T):
 
 @pytest.mark.parametrize("solver", [not_finite, refused, moved_apart])
 @pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.fault(36)
 def test_a_solver_that_fails_changes_nothing(monkeypatch, solver, robust):
     rng = np.random.default_rng(19)
     truth = ring(4)

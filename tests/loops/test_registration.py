@@ -83,7 +83,7 @@ def test_exact_points_give_the_exact_motion(seed):
     pairs = pairs_of(T, cloud(rng, 40))
     found = ransac.ransac(pairs, 0)
     assert found is not None
-    refined, inlier = ransac.refine(pairs, found)
+    refined, inlier = ransac.by_inliers(pairs, found)
     assert inlier.all()
     assert_close(refined, T)
 
@@ -99,7 +99,7 @@ def test_outliers_change_nothing(seed, share):
     pairs = ransac.Pairs(p_current, p_other)
     found = ransac.ransac(pairs, 0)
     assert found is not None
-    refined, inlier = ransac.refine(pairs, found)
+    refined, inlier = ransac.by_inliers(pairs, found)
     right = np.delete(np.arange(100), wrong)
     assert inlier[right].all()
     # an outlier or two may lie within the gate by chance; their pull is bounded by the noise assumed
@@ -118,7 +118,7 @@ def test_refinement_beats_distances_where_depth_is_noisy():
             for p in (p_current, p_other)
         ]
         pairs = ransac.Pairs(*noisy)
-        refined, _ = ransac.refine(pairs, T)
+        refined, _ = ransac.by_inliers(pairs, T)
         errors.append([distance(found, T)[0] for found in (refined, align_rigid(*noisy))])
     ours, oracle = np.median(errors, axis=0)
     assert ours < oracle
@@ -153,7 +153,7 @@ def test_deviation_predicts_the_scatter():
         z = p_other[:, 2:] + rng.normal(size=(40, 1)) * ransac.depth_noise(p_other[:, 2:])
         aside = p_other[:, :2] / p_other[:, 2:] + rng.normal(size=(40, 2)) * ransac.DIRECTION_NOISE
         noisy = ransac.Pairs(p_current, np.concatenate([aside * z, z], axis=1))
-        errors.append(distance(ransac.refine(noisy, T)[0], T)[0])
+        errors.append(distance(ransac.by_inliers(noisy, T)[0], T)[0])
     position, _ = ransac.deviation(pairs_of(T, p), T)
     # three axes, of which `position` is the greatest; robust weights cost some efficiency
     assert 0.7 * position < np.sqrt(np.mean(np.square(errors))) < 3**0.5 * 1.3 * position

@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import KDTree
 
 from mipsjax.errors import OutputError
-from mipsjax.mesh import meshing
+from mipsjax.mesh import lattice, meshing
+from mipsjax.mesh.ply import export_ply
 
 VOXEL = 0.02
 RADIUS = 0.83
@@ -45,7 +47,7 @@ def test_sphere_is_accurate_closed_and_faces_free_space():
     # linear interpolation of a distance along an edge errs by at most voxel^2 / (8 R), the nudge 20 um
     assert np.abs(off).max() < VOXEL / 100
     # a sphere of 1.7 m spans several tiles in each direction: closed means that they are joined
-    assert np.ptp(mesh.vertices, axis=0).min() > 2 * meshing.TILE * VOXEL
+    assert np.ptp(mesh.vertices, axis=0).min() > 2 * lattice.TILE * VOXEL
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.euler_number == 2
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=2e-3)
@@ -78,11 +80,11 @@ def test_a_noisy_field_is_joined_without_seams():
 
 def test_the_same_surface_whatever_the_tiling(monkeypatch):
     whole = meshing.extract(sphere, on_sphere(), VOXEL)
-    monkeypatch.setattr(meshing, "TILE", 16)
-    monkeypatch.setattr(meshing, "QUERY_POINTS", 1000)
+    monkeypatch.setattr(lattice, "TILE", 16)
+    monkeypatch.setattr(lattice, "QUERY_POINTS", 1000)
     small = meshing.extract(sphere, on_sphere(), VOXEL)
     assert len(small.vertices) == len(whole.vertices) and len(small.faces) == len(whole.faces)
-    distance, index = meshing.KDTree(whole.vertices).query(small.vertices)
+    distance, index = KDTree(whole.vertices).query(small.vertices)
     # float32 rounding of the coordinates in a tile, 4e-6 voxels, and of the result
     assert distance.max() < 1e-6 and len(np.unique(index)) == len(index)
 
@@ -101,7 +103,7 @@ def test_unobserved_space_is_neither_queried_nor_meshed():
     # a point may be rounded to the lattice by half a cell diagonal; mesh vertices lie between queried ones
     limit = margin + VOXEL * np.sqrt(3) / 2
     for points in (np.concatenate(asked), mesh.vertices):
-        distance, _ = meshing.KDTree(seen).query(points)
+        distance, _ = KDTree(seen).query(points)
         assert distance.max() <= limit + 1e-6
     assert not mesh.is_watertight and mesh.vertices[:, 2].min() > CENTRE[2] + 0.1 - limit
 
@@ -118,6 +120,7 @@ def test_each_lattice_vertex_is_queried_once():
     assert len(np.unique(np.rint(lattice / VOXEL), axis=0)) == len(lattice)
 
 
+@pytest.mark.fault(53)
 def test_values_that_cannot_be_trusted_leave_holes_not_nans():
     def query(points):
         tsdf, entropy = sphere(points)
@@ -162,7 +165,7 @@ def test_colour_and_uncertainty_belong_to_their_vertices(tmp_path):
     np.testing.assert_allclose(mesh.vertex_attributes["uncertainty"], mesh.vertices[:, 0], atol=1e-6)
     expected = np.rint(255 * np.clip(0.5 + 0.5 * mesh.vertices.astype(np.float32), 0, 1))
     assert np.abs(np.asarray(mesh.visual.vertex_colors)[:, :3] - expected).max() <= 1
-    meshing.export_ply(tmp_path / "mesh.ply", mesh)
+    export_ply(tmp_path / "mesh.ply", mesh)
     read = trimesh.load(tmp_path / "mesh.ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.faces, mesh.faces)
@@ -174,16 +177,17 @@ def test_colour_and_uncertainty_belong_to_their_vertices(tmp_path):
 def test_same_bytes_twice_and_for_shuffled_points(tmp_path):
     points = on_sphere()
     for name, seen in (("a", points), ("b", points), ("c", np.random.default_rng(1).permutation(points))):
-        meshing.export_ply(tmp_path / name, meshing.extract(sphere, seen, VOXEL))
+        export_ply(tmp_path / name, meshing.extract(sphere, seen, VOXEL))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((4, 3), np.nan), np.full((5, 3), 3.0)])
+@pytest.mark.fault(53)
 def test_no_surface_gives_an_empty_mesh_and_a_warning(points, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         mesh = meshing.extract(sphere, points, VOXEL, color=lambda p: p)
     assert len(mesh.faces) == 0 and "no surface" in caplog.text
-    meshing.export_ply(tmp_path / "empty.ply", mesh)
+    export_ply(tmp_path / "empty.ply", mesh)
     read = trimesh.load_mesh(tmp_path / "empty.ply", process=False)
     assert len(read.vertices) == 0 and len(read.faces) == 0
     assert len(meshing.cull(mesh, points, 0.1).vertices) == 0
@@ -209,7 +213,7 @@ def test_points_beyond_the_lattice_are_refused():
 
 
 def test_a_margin_wider_than_a_tile(monkeypatch):
-    monkeypatch.setattr(meshing, "TILE", 8)
+    monkeypatch.setattr(lattice, "TILE", 8)
     mesh = meshing.extract(sphere, on_sphere(1), 0.1, margin_m=2.0)
     assert mesh.is_watertight
 
@@ -227,8 +231,8 @@ def test_cull_keeps_what_is_near_with_its_attributes():
 def test_an_unwritable_place_is_reported_and_leaves_nothing(tmp_path):
     mesh = trimesh.creation.box()
     with pytest.raises(OutputError, match="cannot write"):
-        meshing.export_ply(tmp_path / "missing" / "mesh.ply", mesh)
+        export_ply(tmp_path / "missing" / "mesh.ply", mesh)
     (tmp_path / "mesh.ply").mkdir()
     with pytest.raises(OutputError, match="cannot write"):
-        meshing.export_ply(Path(tmp_path / "mesh.ply"), mesh)
+        export_ply(Path(tmp_path / "mesh.ply"), mesh)
     assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]

@@ -44,7 +44,7 @@ def travelled(keyframes: tuple[int, ...], until: int, cfg: Config = CFG) -> Slam
     for place in range(until + 1):
         record = Record(place, place / 30, 0, 0, PATH[place], Status.OK, is_keyframe=place in keyframes)
         found = follow_all(state, frame(place), PATH[max(place - 1, 0)], cfg)
-        state = state._replace(records=state.records.appended(record))
+        state = state.with_record(record)
         state = with_corners(state, own(place, cfg), found, cfg)
     return state
 
@@ -62,7 +62,7 @@ def test_a_keyframe_that_is_out_of_sight_is_let_go():
     found = follow_all(state, frame(4), PATH[3], CFG)
     assert [seen.reference.record for seen in found] == [3, 1, 0]
     record = state.records[-1]._replace(T_keyframe_cam=PATH[4])
-    later = state._replace(records=state.records.appended(record))
+    later = state.with_record(record)
     assert [c.record for c in with_corners(later, own(4), found[:2], CFG).corners] == [4, 1]
     assert [c.record for c in with_corners(later, own(4), [], CFG).corners] == [4, 1, 0]
 

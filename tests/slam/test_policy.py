@@ -163,6 +163,7 @@ def test_the_papers_spacing_of_keyframes():
 @pytest.mark.parametrize(
     ("trouble", "factor"), [(0, 1.0), (1, 1.5), (2, 2.25), (3, 3.0), (100, 3.0), (10_000, 3.0)]
 )
+@pytest.mark.fault(24)
 def test_the_search_widens_with_trouble_up_to_a_limit(trouble, factor):
     assert widening(trouble, CFG) == pytest.approx(factor)
 

@@ -7,7 +7,7 @@ import pytest
 
 import maps
 from mipsjax.config.sections import Config
-from mipsjax.core.solvers import Information
+from mipsjax.core.information import Information
 from mipsjax.core.tracking import TrackInfo
 from mipsjax.data.sequence import Frame
 from mipsjax.images.corners import Corners
@@ -66,7 +66,7 @@ def test_a_camera_that_nobody_sees_may_be_anywhere_soon():
         held = coasting(state, Frame(place, place / 30, None, None), CFG)
         deviations.append(float(np.sqrt(held.covariance[0, 0])))
         record = state.records[-1]._replace(timestamp=place / 30, status=Status.LOST, held=held)
-        state = state._replace(records=state.records.appended(record))
+        state = state.with_record(record)
     assert np.all(np.diff(deviations) > 0) and 0.5 < deviations[-1] < 5.0  # of a second, in metres
 
 

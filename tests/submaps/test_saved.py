@@ -134,6 +134,7 @@ def flipped(data: bytes, bit: int) -> bytes:
     return bytes(changed)
 
 
+@pytest.mark.fault(44)
 def test_a_flipped_bit_is_found_or_changes_nothing(state: SlamState, file: Path, tmp_path: Path) -> None:
     """Where it changes nothing it is in what zip keeps beside, as a date. Half of them are in its tables at the end."""
     data, rng = file.read_bytes(), np.random.default_rng(0)
@@ -154,6 +155,7 @@ def test_a_flipped_bit_is_found_or_changes_nothing(state: SlamState, file: Path,
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+@pytest.mark.fault(44)
 def test_a_truncated_file_is_refused(file: Path, share: float) -> None:
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])

@@ -11,12 +11,14 @@ import pytest
 import maps
 from mipsjax.config.presets import PRESETS
 from mipsjax.core import mapping
+from mipsjax.images.features import Features
+from mipsjax.loops.registration import MIN_INLIERS
 from mipsjax.slam import recovery
 from mipsjax.submaps import switching
 from mipsjax.submaps.astray import deviations_from_first
 from mipsjax.submaps.proposals import Sighting, proposed, with_links
 from mipsjax.submaps.state import How, SlamState
-from mipsjax.submaps.switching import NEW, NOT_FINITE, STAY, enter, govern
+from mipsjax.submaps.switching import FULL, NEW, NOT_FINITE, STAY, enter, govern
 from mipsjax.uncertainty.held import OPEN
 
 CFG = PRESETS["tiny"]
@@ -62,6 +64,7 @@ def test_a_new_submap_that_is_not_finite_is_not_entered(state, monkeypatch):
 
 
 LOOSE = np.diag([0.0, 0.0, 0.0, 0.0, 0.05, 0.0]) ** 2
+SEEN = Features(np.zeros((MIN_INLIERS, 64), np.uint8), np.zeros((MIN_INLIERS, 3), np.float32), maps.DEPTH)
 SHORT = replace(CFG, map=replace(CFG.map, submap_steps=1))
 
 
@@ -74,15 +77,33 @@ def test_a_new_submap_is_as_far_off_as_the_frame_that_it_is_begun_at(state):
 
 
 def test_a_submap_of_a_lost_camera_may_be_anywhere(state):
-    found = recovery.start_anew(state, maps.keyframe(10), SHORT)
-    assert found is not None
-    metres, _ = deviations_from_first(found.state, found.state.active, found.covariance, found.T_sub_cam)
+    found, problem = recovery.start_anew(state, maps.keyframe(10)._replace(features=SEEN), SHORT)
+    assert found is not None and not problem
+    metres, _ = deviations_from_first(found.state, found.submap, found.covariance, found.T_sub_cam)
     assert metres >= OPEN
+
+
+def test_a_lost_camera_begins_no_submap_that_nothing_could_join(state):
+    bare = maps.keyframe(10)
+    few = SEEN._replace(p_cam=SEEN.p_cam[: MIN_INLIERS - 1])
+    for keyframe in (bare, bare._replace(features=few)):
+        assert recovery.start_anew(state, keyframe, SHORT) == (None, recovery.BLANK)
 
 
 def test_a_lost_camera_begins_no_submap_that_is_not_finite(state, monkeypatch):
     fits_not(monkeypatch, recovery)
-    assert recovery.start_anew(state, maps.keyframe(10), CFG) is None
+    assert recovery.start_anew(state, maps.keyframe(10)._replace(features=SEEN), CFG) == (None, NOT_FINITE)
+
+
+@pytest.mark.fault(50)
+def test_no_more_submaps_begin_than_may(state):
+    many = replace(CFG, volume=replace(CFG.volume, max_submaps=len(state.submaps) + 1))
+    full = replace(CFG, volume=replace(CFG.volume, max_submaps=len(state.submaps)))
+    short = replace(SHORT, volume=full.volume)
+    assert not switching.full(state, CFG) and not switching.full(state, many)
+    after, problem = enter(state, NEW, short)
+    assert after is state and problem == FULL
+    assert recovery.start_anew(state, maps.keyframe(10)._replace(features=SEEN), short) == (None, FULL)
 
 
 def test_steps_on_the_shared_frame_that_are_not_finite_are_reported(state, monkeypatch):

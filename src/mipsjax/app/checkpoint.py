@@ -38,7 +38,7 @@ FOLDER = "checkpoint"
 CONTENT = "checkpoint"
 HALF = re.compile(rf"\.[0-9]+\.npz\.[a-z0-9_]+{re.escape(UNFINISHED)}")
 """Name of one that is being written."""
-PACKAGES = "jax", "jaxlib", "numpy"
+PACKAGES = "jax", "jaxlib", "numpy", "optimistix", "lineax", "equinox"
 """Another version of one may round otherwise."""
 KEPT = 2
 """Checkpoints, the last ones: where one turns out damaged, the one before it serves."""
@@ -51,7 +51,7 @@ class Progress(NamedTuple):
     waited: tuple[FrameRow, ...] = ()
     """Frames before the first usable one."""
     infos: tuple[FrameInfo, ...] = ()
-    """Of the frames in the state's records."""
+    """Of the frames of this recording in the state's records."""
     read_s: tuple[float, ...] = ()
     step_s: tuple[float, ...] = ()
     bad: int = 0
@@ -264,7 +264,7 @@ def _plain(progress: Progress) -> dict[str, Any]:
     """As what a file may hold."""
     plain = progress._asdict()
     plain["waited"] = tuple(
-        (row.number, row.timestamp, row.status, tuple(row.info)) for row in progress.waited
+        (row.frame, row.timestamp, row.status, tuple(row.info)) for row in progress.waited
     )
     plain["infos"] = tuple(tuple(info) for info in progress.infos)
     return plain

@@ -23,7 +23,12 @@ from mipsjax.config.presets import PRESETS, preset
 from mipsjax.config.sections import Config
 from mipsjax.data.open import parse_frames
 from mipsjax.errors import ConfigError, MipsjaxError
+from mipsjax.viewer import PORT
 
+_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
+"""What XLA says where memory is not enough."""
+LARGEST_PORT = (1 << 16) - 1
+"""There is a next one to each that may be asked for."""
 PROGRAM = "python -m mipsjax.run"
 AnyOptions = TypeVar("AnyOptions")
 # An option that is given or not; the other switches have a `no-` form too
@@ -35,7 +40,8 @@ class Options:
     """Turns an RGB-D sequence into a camera trajectory and a coloured mesh.
 
     The preset comes first, then the file of --config, then the options below. Exit codes: 0 done, 1 a bug of
-    ours, 2 wrong options, 3 unusable input, 4 tracking lost, 5 output cannot be written, 130 interrupted.
+    ours or too little memory, 2 wrong options, 3 unusable input, 4 tracking lost, 5 output cannot be written,
+    130 interrupted.
     """
 
     sequence: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE")]
@@ -54,12 +60,27 @@ class Options:
     """Pixels of the depth image, or of an image of W x H."""
     depth_scale: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
     """Depth units per metre."""
+    depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
+    """Depth images of a bag that has several."""
+    color_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
+    """Colour images of a bag that has several."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Goes on with the run in this folder that was cut short; beside it stands nothing but --quiet and --no-mesh."""
+    """Goes on with the run in this folder that was cut short; beside it stands nothing but --quiet, --viewer and
+    --no-mesh."""
+    map: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Starts in the map of an earlier run: the camera is found in it, and it goes on growing."""
+    localise_only: Flag = False
+    """With --map: the camera is found in the map, of which nothing changes. No mesh is made."""
+    no_map: Flag = False
+    """The map is not kept."""
     no_mesh: Flag = False
     """No mesh is made."""
     no_loop: Flag = False
     """No loop is closed: the same as --loop.no-enabled."""
+    viewer: Flag = False
+    """Shows the run in a browser as it goes, with a button that pauses it."""
+    viewer_port: int = PORT
+    """Port of that page, or the next one that is free."""
     quiet: Flag = False
     """Prints nothing but errors."""
     inspect: Flag = False
@@ -83,9 +104,18 @@ def parse(arguments: list[str]) -> Options:
         loop = replace(options.settings.loop, enabled=False)
         options = replace(options, settings=replace(options.settings, loop=loop))
     validate(options.settings)
+    if options.localise_only and options.map is None:
+        raise ConfigError("--localise-only needs --map DIR, the map in which the camera is to be found")
+    check_port(options.viewer_port, "--viewer-port")
     # For its errors alone: frames are chosen where the sequence is opened
     parse_frames(options.frames)
     return options
+
+
+def check_port(port: int, option: str) -> None:
+    """Raises ConfigError for a number that is no port."""
+    if not 0 < port < LARGEST_PORT:
+        raise ConfigError(f"{option} {port}: a port is a number from 1 to {LARGEST_PORT - 1}")
 
 
 def read_options(
@@ -151,12 +181,18 @@ def _open_streams() -> None:
 @contextlib.contextmanager
 def bugs_saved_in(folder: Path | None) -> Iterator[None]:
     """Turns an unforeseen exception into one line and a file with its traceback, in the folder for temporary files if
-    None."""
+    None; one of too little memory, which is no bug, into what makes a run smaller."""
     try:
         yield
     except MipsjaxError:
         raise
     except Exception as error:
+        if isinstance(error, MemoryError) or _OUT_OF_MEMORY in str(error):
+            goes_on = "" if folder is None else f", and --resume {folder} goes on if a checkpoint is there"
+            raise _MemoryError(
+                f"too little memory ({str(error).splitlines()[0] if str(error) else 'no more is given'}): "
+                f"--volume.max-submaps bounds the map, --input.working-width the images{goes_on}"
+            ) from error
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         try:
             # Only here, since without any folder for temporary files it fails
@@ -167,6 +203,12 @@ def bugs_saved_in(folder: Path | None) -> Iterator[None]:
         except OSError as failure:
             where = f"its traceback cannot be written ({failure.strerror})"
         raise _BugError(f"a bug of mipsjax, please report it: {text}; {where}") from error
+
+
+class _MemoryError(MipsjaxError):
+    """This machine has too little for the run."""
+
+    exit_code = 1
 
 
 class _BugError(MipsjaxError):

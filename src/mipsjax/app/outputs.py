@@ -29,8 +29,8 @@ from mipsjax.data.open import SYNTH_PREFIX
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.trajectory import write_tum
 from mipsjax.files import write_atomically
-from mipsjax.mesh.meshing import DOUBLE_FROM_M, export_ply
 from mipsjax.mesh.picture import save_picture, up_direction
+from mipsjax.mesh.ply import DOUBLE_FROM_M, export_ply
 from mipsjax.slam.info import FrameInfo
 from mipsjax.submaps.state import SlamState, Status, trajectory
 
@@ -38,7 +38,7 @@ Meshing = Literal["none", "unfinished", "done"]
 """Of a mesh: not wanted, not made or not made to its end, there."""
 PACKAGES = (
     "mipsjax", "jax", "jaxlib", "jaxlie", "optax", "numpy", "scipy", "opencv-python-headless", "trimesh",
-    "scikit-image", "gtsam",
+    "scikit-image", "gtsam", "optimistix", "lineax", "equinox",
 )  # fmt: skip
 """Whose versions can change a result."""
 
@@ -68,7 +68,7 @@ def write_results(
     """
     assert run.state is not None
     poses = trajectory(run.state)
-    stamps = np.array([record.timestamp for record in run.state.records])
+    stamps = np.array([row.timestamp for row in run.rows[len(run.waited) :]])
     write_tum(folder / "trajectory.txt", stamps, poses)
     if run.T_truth_cam is not None:
         write_tum(folder / "trajectory_gt.txt", stamps, run.T_truth_cam)
@@ -120,7 +120,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def loops_content(state: SlamState) -> dict[str, Any]:
-    """Every loop that was found, kept or not."""
+    """Every loop that was found in this recording, kept or not."""
     return {"schema_version": SCHEMA_VERSION, "loops": loop_rows(state)}
 
 
@@ -135,7 +135,7 @@ def status_csv(rows: tuple[FrameRow, ...]) -> str:
     for row in rows:
         *numbers, note = row.info
         cells = (_cell(value) for value in (*numbers, row.deviation_m, row.deviation_deg, note))
-        writer.writerow([row.number, f"{row.timestamp:.6f}", str(row.status), *cells])
+        writer.writerow([row.frame, f"{row.timestamp:.6f}", str(row.status), *cells])
     return out.getvalue()
 
 
@@ -144,7 +144,7 @@ def events_jsonl(run: Run, notes: Iterable[str]) -> str:
     events: list[dict[str, Any]] = [{"event": "note", "text": note} for note in run.sequence.notes]
     last = Status.OK
     for row in run.rows:
-        where = {"index": row.number, "timestamp": row.timestamp}
+        where = {"index": row.frame, "timestamp": row.timestamp}
         if row.status is Status.LOST:
             events.append({"event": "lost", **where, "reason": row.info.note})
         elif row.status is Status.SKIPPED:

@@ -41,7 +41,9 @@ HOLDER = b"process "
 """What a lock of a run begins with."""
 HOLDER_BYTES = 100
 """Of a lock that are read."""
-FINISHED = ("metrics.json", "trajectory.txt", "mesh.ply")
+MAP = Path("map", "state.npz")
+"""The map that a run keeps."""
+FINISHED = ("metrics.json", "trajectory.txt", "mesh.ply", MAP)
 """A folder with one of these holds results."""
 
 
@@ -112,9 +114,10 @@ def foreign(folder: Path) -> str:
         path = folder / name
         if os.path.lexists(path) and not (ours and path.is_file() and not path.is_symlink()):
             return name
-    kept = folder / checkpoint.FOLDER
-    if os.path.lexists(kept) and not (ours and kept.is_dir() and not kept.is_symlink()):
-        return checkpoint.FOLDER
+    for name in (checkpoint.FOLDER, str(MAP.parent)):
+        inner = folder / name
+        if os.path.lexists(inner) and not (ours and inner.is_dir() and not inner.is_symlink()):
+            return name
     return "" if _may_be_a_lock(folder / LOCK) else LOCK
 
 
@@ -211,8 +214,10 @@ def _remove_parts(folder: Path) -> None:
     """Halves of our files, which a process that was killed left. Nobody else writes here now."""
     names = "|".join(re.escape(name) for name in FILES)
     pattern = re.compile(rf"\.({names})\.[a-z0-9_]{{8}}\.part")
-    for path in folder.iterdir():
-        if pattern.fullmatch(path.name) and stat.S_ISREG(path.lstat().st_mode):
+    of_map = (folder / MAP.parent).glob(f".{MAP.name}.*.part") if (folder / MAP.parent).is_dir() else ()
+    ours = [path for path in folder.iterdir() if pattern.fullmatch(path.name)]
+    for path in (*ours, *of_map):
+        if stat.S_ISREG(path.lstat().st_mode):
             path.unlink(missing_ok=True)
 
 

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mipsjax.app.checkpoint import Progress, identity_in, read, written
-from mipsjax.app.commandline import Options
+from mipsjax.app.commandline import Options, check_port
 from mipsjax.app.summary import failure
 from mipsjax.config.options import merged, validate
 from mipsjax.config.sections import Config
 from mipsjax.errors import ConfigError, InputError, MipsjaxError, TrackingLostError
 from mipsjax.submaps.state import Status
+from mipsjax.viewer import PORT
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,8 @@ def resumed_options(arguments: list[str]) -> Options | None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--resume", type=Path)
     parser.add_argument("--quiet", action="store_true")
+    parser.add_argument("--viewer", action="store_true")
+    parser.add_argument("--viewer-port", type=int, default=PORT)
     parser.add_argument("--no-mesh", action="store_true")
     try:
         given, others = parser.parse_known_args(arguments)
@@ -45,10 +48,14 @@ def resumed_options(arguments: list[str]) -> Options | None:
     if others:
         raise ConfigError(
             f"{others[0]} cannot be given beside --resume: a run goes on as it was begun, by "
-            f"{given.resume / 'config.json'}; only --quiet and --no-mesh can be"
+            f"{given.resume / 'config.json'}; only --quiet, --viewer, --viewer-port and --no-mesh can be"
         )
+    check_port(given.viewer_port, "--viewer-port")
     options = options_in(given.resume)
-    return replace(options, quiet=given.quiet, no_mesh=options.no_mesh or given.no_mesh)
+    no_mesh = options.no_mesh or given.no_mesh
+    return replace(
+        options, quiet=given.quiet, viewer=given.viewer, viewer_port=given.viewer_port, no_mesh=no_mesh
+    )
 
 
 def options_in(folder: Path) -> Options:
@@ -69,7 +76,8 @@ def options_in(folder: Path) -> Options:
     except (ValueError, KeyError, TypeError, ConfigError) as error:
         raise InputError(f"{path}: is not as a run writes it ({error}); begin the run again") from error
     intrinsics = None if options.intrinsics is None else tuple(options.intrinsics)
-    return replace(options, out=folder, intrinsics=intrinsics)
+    started_in = None if options.map is None else Path(options.map)
+    return replace(options, out=folder, intrinsics=intrinsics, map=started_in)
 
 
 class Ended(NamedTuple):

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import fields, replace
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import trimesh
-from tqdm import tqdm
 
 from mipsjax.app import checkpoint, outputs, signals
 from mipsjax.app.checkpoint import Checkpoints, Progress
 from mipsjax.app.commandline import Options, bugs_saved_in, complain, ended, parse, say
 from mipsjax.app.compilation import enable_cache
+from mipsjax.app.kept_map import opened_map, write_map
+from mipsjax.app.memory import return_memory
+from mipsjax.app.progress import progress, teller
 from mipsjax.app.results_folder import choose_folder, claimed, sibling
 from mipsjax.app.resume import end_of, progress_in, resumed_options
-from mipsjax.app.summary import MIN_USABLE, FrameRow, Run, failure, verdict
-from mipsjax.config.sections import CheckpointConfig, Config, InputConfig, MeshConfig
+from mipsjax.app.summary import MIN_USABLE, OUTGROWN, FrameRow, Run, failure, outgrown, verdict
+from mipsjax.config.sections import Config
 from mipsjax.data.open import SYNTH_PREFIX, describe, open_sequence, parse_frames
-from mipsjax.data.sequence import Sequence
+from mipsjax.data.sequence import Frame, Sequence
 from mipsjax.data.suspicion import suspicions_of_truth
 from mipsjax.errors import InputError, MipsjaxError
 from mipsjax.mesh.reconstruct import reconstruct
@@ -33,13 +36,13 @@ from mipsjax.slam import step as slam
 from mipsjax.slam.finish import finish
 from mipsjax.slam.info import FrameInfo
 from mipsjax.slam.judge import judged
+from mipsjax.slam.localise import localise
+from mipsjax.submaps.ids import FrameId
 from mipsjax.submaps.schedule import executor
 from mipsjax.submaps.state import Pose, SlamState, Status, trajectory
+from mipsjax.viewer.live import Viewer, is_installed, viewer
 
 log = logging.getLogger(__name__)
-
-LINE_EVERY = 50
-"""Frames between two lines of progress where there is no terminal."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -54,17 +57,20 @@ def travel(
     tell: Callable[[Status], None],
     kept: Checkpoints,
     before: Progress = Progress(),  # noqa: B008 (a value)
+    learn: bool = True,
+    show: Callable[[SlamState, FrameInfo, Frame], None] | None = None,
 ) -> Run:
     """All frames in turn, after those of `before`, until `stop` says so or too many are bad. `tell` hears the status
-    of each, and `kept` writes checkpoints.
+    of each, `show` gets each with the state after it, and `kept` writes checkpoints. Without `learn` the map of
+    `before` stays as it is.
 
-    The map starts with the first frame that has colour and enough depth; frames before it are passed over.
+    A new map starts with the first frame that has colour and enough depth; frames before it are passed over.
     """
-    state, bad, core = before.state, before.bad, _of_the_method(cfg)
+    state, bad = before.state, before.bad
     waited, infos = list(before.waited), list(before.infos)
     read_s, step_s = list(before.read_s), list(before.step_s)
 
-    def progress() -> Progress:
+    def so_far() -> Progress:
         return Progress(state, tuple(waited), tuple(infos), tuple(read_s), tuple(step_s), bad)
 
     with executor(cfg.background.executor) as beside:
@@ -76,27 +82,31 @@ def travel(
             frame = sequence[position]
             read_s.append(perf_counter() - began)
             if state is not None:
-                state, info = slam.step(state, frame, core, beside)
+                state, info = slam.step(state, frame, cfg, beside) if learn else localise(state, frame, cfg)
                 infos.append(info)
-            elif reason := slam.anchor_problem(frame):
-                waited.append(FrameRow(frame.number, frame.timestamp, Status.SKIPPED, FrameInfo(note=reason)))
+            elif reason := slam.anchor_problem(frame, cfg):
+                waited.append(
+                    FrameRow(FrameId(frame.number), frame.timestamp, Status.SKIPPED, FrameInfo(note=reason))
+                )
             else:
-                state, info = slam.start(frame, sequence.intrinsics, core, _true_pose(sequence, position))
+                state, info = slam.start(frame, sequence.intrinsics, cfg, _true_pose(sequence, position))
                 infos.append(info)
             step_s.append(perf_counter() - began - read_s[-1])
             status = Status.SKIPPED if state is None else state.records[-1].status
             bad += status is Status.SKIPPED
             if state is not None:
-                waited_ms = kept.after(infos[-1].keyframe, progress)
+                waited_ms = kept.after(infos[-1].keyframe, so_far)
                 infos[-1] = infos[-1]._replace(checkpoint_ms=waited_ms)
+                if show is not None:
+                    show(state, infos[-1], frame)
             tell(status)
         interrupted = len(read_s) < len(sequence) and bad <= cfg.input.max_bad_frames
         # Before `finish`, which ends the map: what is resumed goes on with the next frame
         if interrupted and state is not None:
-            kept.last(progress())
+            kept.last(so_far())
         began = perf_counter()
-        if state is not None:
-            state = finish(state, core, beside)
+        if state is not None and learn:
+            state = finish(state, cfg, beside)
     finish_s = perf_counter() - began
     too_bad = bad > cfg.input.max_bad_frames
     end = "bad frames" if too_bad else "interrupted" if interrupted else "done"
@@ -110,7 +120,7 @@ def _main(arguments: list[str]) -> int:
 
 def _run(options: Options) -> int:
     """Opens, tracks, writes; the exit code where that is no error. Raises MipsjaxError."""
-    cfg, tell = options.settings, _teller(options.quiet)
+    cfg, tell = options.settings, teller(options.quiet)
     if options.resume is not None and (ended := end_of(options.resume)):
         if ended.failure is not None:
             raise ended.failure(ended.text)
@@ -121,7 +131,7 @@ def _run(options: Options) -> int:
     sequence = _open(options)
     opened_s = perf_counter() - began
     folder = options.resume or choose_folder(sequence.name, options.out, _source(options))
-    identity, before = checkpoint.identity(cfg, sequence), Progress()
+    identity, before, learn = checkpoint.identity(cfg, sequence), Progress(), not options.localise_only
     with (
         signals.noted() as stop,
         claimed(folder) as held,
@@ -129,6 +139,8 @@ def _run(options: Options) -> int:
         _warnings(tell) as remarks,
     ):
         tell("\n".join([f"{sequence.name}: {len(sequence)} frames, results in {folder}", *sequence.notes]))
+        if options.map is not None and options.resume is None:
+            before = Progress(opened_map(options.map, cfg, sequence))
         if options.resume is None:
             outputs.write_config(folder, cfg, _plain_options(options), sequence)
         else:
@@ -137,31 +149,39 @@ def _run(options: Options) -> int:
             remarks[:0] = before.remarks
             tell(f"goes on after {len(before.read_s)} frames")
         with (
+            _viewer(options, sequence, tell) as page,
             checkpoint.checkpoints(folder, identity, cfg.checkpoint, remarks) as kept,
-            _progress(len(sequence), len(before.read_s), options.quiet) as tell_status,
+            progress(len(sequence), len(before.read_s), options.quiet) as tell_status,
         ):
-            run = travel(sequence, cfg, stop, tell_status, kept, before)
+            show = None if page is None else page.after
+            go_no_further = stop if page is None else partial(page.wait, stop)
+            run = travel(sequence, cfg, go_no_further, tell_status, kept, before, learn, show)
         state = run.state
-        if state is None:
+        if state is None or not run.infos:
             raise _nothing_usable(run)
-        _return_memory()
+        return_memory()
         began = perf_counter()
         run = run._replace(agreement=judged(state, cfg))
         judged_s = perf_counter() - began
         if run.T_truth_cam is not None:
             for remark in suspicions_of_truth(trajectory(state), run.T_truth_cam):
                 log.warning(remark)
+        if outgrown(run):
+            log.warning(OUTGROWN)
         if not held():
             log.warning("%s was deleted or taken by another run meanwhile", folder)
             folder = sibling(folder)
             outputs.write_config(folder, cfg, _plain_options(options), sequence)
             log.warning("the results go to %s", folder)
         seconds = {"open": opened_s, "judge": judged_s}
-        meshing = "none" if options.no_mesh else "unfinished"
+        with_mesh = learn and not options.no_mesh
+        meshing = "unfinished" if with_mesh else "none"
         content = outputs.write_results(folder, run, None, seconds, remarks, meshing)
         # A signal that came after the last frame ends the program before the mesh
         late = stop() and run.end == "done"
-        if not options.no_mesh:
+        if learn and not options.no_map and run.end != "interrupted":
+            write_map(folder, state, cfg)
+        if with_mesh:
             began = perf_counter()
             mesh = None if late else _mesh(state, cfg)
             if mesh is None:
@@ -172,7 +192,19 @@ def _run(options: Options) -> int:
         if run.end != "interrupted":
             checkpoint.remove(folder)
         tell(_summary(content))
+        if options.viewer and is_installed():
+            tell(f"python -m mipsjax.view {folder} shows it")
         return _exit_code(run, folder)
+
+
+def _viewer(
+    options: Options, sequence: Sequence, tell: Callable[[str], None]
+) -> AbstractContextManager[Viewer | None]:
+    """The page beside a run, if one is wanted; true poses are shown where the map lies as they do."""
+    if not options.viewer:
+        return nullcontext()
+    truth = None if options.map is not None or _true_pose(sequence, 0) is None else sequence.T_world_cam
+    return viewer(options.settings, tell, options.viewer_port, truth)
 
 
 def _mesh(state: SlamState, cfg: Config) -> trimesh.Trimesh | None:
@@ -182,12 +214,6 @@ def _mesh(state: SlamState, cfg: Config) -> trimesh.Trimesh | None:
             return reconstruct(state, cfg)
     except KeyboardInterrupt:
         return None
-
-
-def _return_memory() -> None:
-    """Hands back what glibc keeps although nothing uses it: over 100 MB after tracking, and the mesh needs more."""
-    with suppress(AttributeError, OSError, TypeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _exit_code(run: Run, folder: Path) -> int:
@@ -217,7 +243,12 @@ def _why(run: Run, folder: Path) -> str:
         )
     if len(rows) - len(bad) < MIN_USABLE:
         return f"only 1 of {len(rows)} frames is usable, the others are like: {bad[-1].info.note}"
-    lost = [row.number for row in rows if row.status is Status.LOST]
+    if run.state is not None and not run.state.located:
+        return (
+            f"the camera was not found in the map in any of {len(rows)} frames; the results in {folder} are marked as "
+            "failed; is it of the same place, and has it colour?"
+        )
+    lost = [row.frame for row in rows if row.status is Status.LOST]
     return (
         f"tracking was lost in {len(lost)} of {len(rows)} frames, first in frame {lost[0]}; the results "
         f"in {folder} are marked as failed; more --track.ro.particles or --map.steps may help"
@@ -248,15 +279,12 @@ def _open(options: Options) -> Sequence:
         depth_scale=options.depth_scale,
         frames=parse_frames(options.frames),
         input=options.settings.input,
+        depth_topic=options.depth_topic,
+        color_topic=options.color_topic,
     )
     if len(sequence) < MIN_USABLE:
         raise InputError(f"{options.sequence}: 1 frame selected, at least {MIN_USABLE} are needed")
     return sequence
-
-
-def _of_the_method(cfg: Config) -> Config:
-    """The config as compiled code sees it: options of reading, meshing and saving must not compile tracking anew."""
-    return replace(cfg, input=InputConfig(), mesh=MeshConfig(), checkpoint=CheckpointConfig())
 
 
 def _true_pose(sequence: Sequence, position: int) -> Pose | None:
@@ -277,7 +305,10 @@ def _plain_options(options: Options) -> dict[str, Any]:
         for item in fields(options)
         if item.name not in ("settings", "resume")
     }
-    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+    # Whatever folder one is in when it goes on
+    return {
+        name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in values.items()
+    }
 
 
 def _summary(content: dict[str, Any]) -> str:
@@ -288,37 +319,6 @@ def _summary(content: dict[str, Any]) -> str:
     parts += [f"{content['keyframes']} keyframes"]
     parts += [f"ATE {100 * ate:.2f} cm"] if ate is not None else []
     return ", ".join(parts)
-
-
-def _teller(quiet: bool) -> Callable[[str], None]:
-    return (lambda text: None) if quiet else say
-
-
-@contextmanager
-def _progress(count: int, before: int, quiet: bool) -> Iterator[Callable[[Status], None]]:
-    """A function that is told of each frame after those before: a bar on a terminal, or else a line now and then."""
-    if not quiet and sys.stderr.isatty():
-        bar = tqdm(total=count, initial=before, unit="frame", file=sys.stderr)
-        try:
-            yield lambda status: _advance(bar, status)
-        finally:
-            with suppress(OSError):
-                bar.close()
-        return
-    done, tell_line = [before], _teller(quiet)
-
-    def tell(status: Status) -> None:
-        done[0] += 1
-        if done[0] % LINE_EVERY == 0 or done[0] == count:
-            tell_line(f"frame {done[0]} of {count}: {status}")
-
-    yield tell
-
-
-def _advance(bar: tqdm, status: Status) -> None:
-    with suppress(OSError):  # where the terminal is closed
-        bar.set_postfix_str(str(status), refresh=False)
-        bar.update()
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
@@ -12,6 +11,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64
 
+from mipsjax.app.memory import peak_memory
 from mipsjax.data.sequence import Sequence
 from mipsjax.data.synth import SynthSequence
 from mipsjax.errors import InputError, MipsjaxError, TrackingLostError
@@ -19,6 +19,7 @@ from mipsjax.metrics import surface
 from mipsjax.metrics.poses import absolute_error, relative_error, translation_error
 from mipsjax.slam.info import FrameInfo
 from mipsjax.slam.judge import contradiction
+from mipsjax.submaps.ids import FrameId
 from mipsjax.submaps.links import unjoined
 from mipsjax.submaps.state import (
     SlamState,
@@ -30,17 +31,13 @@ from mipsjax.submaps.state import (
 )
 from mipsjax.uncertainty.agreement import DEVIATIONS, DRIFT, LIMIT, Agreement
 
-try:
-    import resource
-except ImportError:  # not on Windows
-    resource = None
-
 SCHEMA_VERSION = 1
 """Of the output files; rises when a key changes its meaning."""
 REFERENCE_VOXEL_M = 0.02
 """Cells of the true mesh of synthetic scenes: vertices lie on the surface, only edges are cut."""
 MIN_USABLE = 2
 """Frames that make a sequence."""
+OUTGROWN = "the camera left the map, which is as large as --volume.max-submaps allows"
 MOST_VIEWS = 60
 """Frames that decide which part of the true mesh was seen; more take long and add little."""
 
@@ -50,8 +47,8 @@ Verdict = Literal["ok", "degraded", "failed"]
 class FrameRow(NamedTuple):
     """One frame in status.csv."""
 
-    number: int
-    """In the sequence."""
+    frame: FrameId
+    """Its number in the sequence."""
     timestamp: float
     """Seconds."""
     status: Status
@@ -71,7 +68,7 @@ class Run(NamedTuple):
     waited: tuple[FrameRow, ...]
     """Frames before the first usable one."""
     infos: tuple[FrameInfo, ...]
-    """What was said about each frame in the state's records."""
+    """What was said about each frame of this recording in the state's records."""
     read_s: tuple[float, ...]
     """Seconds to read each frame."""
     step_s: tuple[float, ...]
@@ -94,12 +91,12 @@ class Run(NamedTuple):
             return None
         # Frames before the first usable one have no record
         first = len(self.waited)
-        return self.sequence.T_world_cam[first : first + len(self.state.records)]
+        return self.sequence.T_world_cam[first : first + len(self.infos)]
 
 
 def _rows(state: SlamState, infos: tuple[FrameInfo, ...]) -> tuple[FrameRow, ...]:
     rows = []
-    for record, info in zip(state.records, infos, strict=True):
+    for record, info in zip(state.records[state.first :], infos, strict=True):
         metres, radians = deviations_of(state, record)
         row = FrameRow(record.frame, record.timestamp, record.status, info)
         rows.append(row._replace(deviation_m=metres, deviation_deg=math.degrees(radians)))
@@ -138,6 +135,11 @@ def failure(end: str, status: str, usable: int) -> type[MipsjaxError] | None:
     return TrackingLostError if status == "failed" else None
 
 
+def outgrown(run: Run) -> bool:
+    """Whether the camera left the map where no other submap might begin."""
+    return any(info.full for info in run.infos)
+
+
 def reasons(run: Run) -> list[str]:
     """Why a run is not `ok`, or might not be; empty where there is nothing to say."""
     statuses = [row.status for row in run.rows]
@@ -145,6 +147,8 @@ def reasons(run: Run) -> list[str]:
     if run.agreement is not None and run.state is not None:
         contradicted = contradiction(run.state, run.agreement)
     found = [f"lost in {lost} of {len(statuses)} frames"] if lost else []
+    if outgrown(run):
+        found.append(OUTGROWN)
     if len(statuses) - statuses.count(Status.SKIPPED) < MIN_USABLE:
         found.append("fewer than two usable frames")
     return [*found, contradicted] if contradicted else found
@@ -177,17 +181,17 @@ def metrics_content(run: Run, mesh: trimesh.Trimesh | None, seconds: dict[str, f
         "frames": len(rows),
         "seconds": total,
         "seconds_per_stage": stages,
-        "peak_memory_bytes": _peak_memory(),
+        "peak_memory_bytes": peak_memory(),
         "submaps": len(run.state.submaps),
         "unjoined_submaps": unjoined(run.state),
         "keyframes": keyframes(run.state),
-        "loops": sum(loop.weight > 0 for loop in run.state.loops),
+        "loops": sum(loop["weight"] > 0 for loop in loop_rows(run.state)),
         "loops_found": loop_rows(run.state),
         "status_counts": {str(status): [row.status for row in rows].count(status) for status in Status},
         "ro_frames": sum(row.info.searched for row in rows),
         "map_bytes": map_bytes(run.state),
         "bad_frames": [
-            {"index": row.number, "reason": row.info.note}
+            {"index": row.frame, "reason": row.info.note}
             for row in rows
             if row.info.note and row.status is not Status.LOST
         ],
@@ -223,7 +227,7 @@ def contradicted_part(run: Run) -> dict[str, Any] | None:
 
 
 def loop_rows(state: SlamState) -> list[dict[str, Any]]:
-    """Every loop that was found, in order: between which submaps, how, and what became of it."""
+    """Every loop that was found in this recording, in order: between which submaps, how, and what became of it."""
     return [
         {
             "index": state.records[loop.record].frame,
@@ -235,7 +239,7 @@ def loop_rows(state: SlamState) -> list[dict[str, Any]]:
             "correction_cm": 100 * loop.correction_m,
             "correction_deg": math.degrees(loop.correction_rad),
         }
-        for loop in state.loops
+        for loop in state.loops[state.older_loops :]
     ]
 
 
@@ -287,6 +291,8 @@ def surface_errors(sequence: SynthSequence, run: Run, mesh: trimesh.Trimesh) -> 
     names = ("accuracy_m", "completeness_m", "completion_ratio", "f_score")
     if len(mesh.faces) == 0:
         return {name: Number(None, "the mesh is empty") for name in names}
+    if run.state is not None and run.state.first:
+        return {name: Number(None, "the mesh has what earlier recordings saw, too") for name in names}
     first, count = len(run.waited), len(run.rows)
     chosen = np.unique(np.linspace(first, count - 1, min(MOST_VIEWS, count - first)).astype(int))
     depths = (sequence[int(position)].depth for position in chosen)
@@ -315,7 +321,10 @@ def surface_errors(sequence: SynthSequence, run: Run, mesh: trimesh.Trimesh) -> 
 
 def _speed(run: Run) -> dict[str, Number]:
     """Frames a second, with and without the two calls that compile."""
-    tracked = [s for s, row in zip(run.step_s, run.rows, strict=True) if row.status is not Status.SKIPPED]
+    timed = list(zip(run.step_s, run.rows, strict=True))
+    # Those before the camera is found in a map compile nothing of tracking
+    begins = next((i for i, (_, row) in enumerate(timed) if row.status.trusted), 0)
+    tracked = [s for s, row in timed[begins:] if row.status is not Status.SKIPPED]
     steady = tracked[2:]
     total = sum(run.step_s) + sum(run.read_s)
     return {
@@ -328,11 +337,3 @@ def _speed(run: Run) -> dict[str, Number]:
             "all frames, with reading images and with compilation",
         ),
     }
-
-
-def _peak_memory() -> int | None:
-    """Bytes of memory the process has used at most."""
-    if resource is None:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if platform.system() == "Darwin" else 1024 * peak  # bytes on macOS, kilobytes on Linux

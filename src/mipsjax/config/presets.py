@@ -35,12 +35,11 @@ UNGUARDED = GuardConfig(
     residual_unsure=float("inf"),
     residual_lost=float("inf"),
 )
-"""Judges a pose by its pixels that are known, and that have depth, alone: the paper has no guard, and a map of `tiny`
-is certain of nothing."""
+"""Judges a pose by its pixels that are known, and that have depth, alone: a map of `tiny` is certain of nothing. The
+paper has no guard; `paper` has ours, so that a camera that is metres off is not called `ok`."""
 
 PAPER = Config(
     sensor=SensorConfig(noise_growth=0.0),
-    # The two softmaxes in a row saturate: kept, since they are the paper's (docs/method.md, b)
     field=FieldConfig(encoding="frequency", coldness=10.0, normalised=True),
     sample=SampleConfig(uniform=20, truncation=20, surface=10, perpendicular=False),
     # All 20 + 20 + 10 samples of a ray carry colour
@@ -70,7 +69,6 @@ PAPER = Config(
         # How far a pose may be off is still stated; nothing follows from it
         held=HeldConfig(loose=UNLIMITED, weak=UNLIMITED, unsure=UNLIMITED),
     ),
-    guard=UNGUARDED,
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),
     # The nearest to a second process that refines all the time

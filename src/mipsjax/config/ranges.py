@@ -176,6 +176,7 @@ RANGES: dict[str, Range] = {
     "guard.lost": SHARE,
     "guard.confirmed": SHARE,
     "guard.measured": SHARE,
+    "guard.first_measured": SHARE,
     # Infinite: no frame is lost by its residual
     "guard.residual": SWITCH,
     "guard.residual_unsure": SWITCH,
@@ -188,6 +189,7 @@ RANGES: dict[str, Range] = {
     "volume.hysteresis": SHARE,
     "volume.support": NOT_NEGATIVE,
     "volume.margin": NOT_NEGATIVE,
+    "volume.max_submaps": NOT_NEGATIVE,
     "background.every_frames": NOT_NEGATIVE,
     "background.steps": NOT_NEGATIVE,
     "background.together": COUNT,

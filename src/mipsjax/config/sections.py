@@ -57,10 +57,10 @@ class FieldConfig:
     classes: int = 5
     """Of the distance, evenly from -`truncation` to `truncation`."""
     coldness: float = 1.0
-    """beta of the soft argmax (Eq. 2; paper: 10, on outputs that sum to 1)."""
+    """beta of the soft argmax (Eq. 2; paper: 10, on normalised outputs)."""
     normalised: bool = False
-    """The outputs z are normalised to sum to 1 before the soft argmax, as in the paper. Its two softmaxes in a
-    row saturate: the sinusoidal field then stays at one class (docs/method.md)."""
+    """The outputs z are numbers in 0..1, each by a sigmoid, before the soft argmax: as the paper's "normalised" vector
+    can be learned. Made to sum to 1, they saturate at one class (docs/method.md)."""
     octaves: int = 6
     """Of the sinusoids, for each coordinate."""
     longest_wavelength: float = 8.0

@@ -28,6 +28,9 @@ class VolumeConfig:
     margin: float = 0.1
     """Metres added to the box beyond what a keyframe sees; not in the paper. As the truncation, so that the region
     behind a wall in which its distance is learned belongs to the box."""
+    max_submaps: int = 0
+    """Submaps at most, which bounds the memory; 0 is no limit. The active one stays so beyond its box, where frames
+    are held by the keyframes alone."""
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,9 @@ class GuardConfig:
     measured: float = 0.05
     """Share of pixels with depth below which a frame that is not lost is weak, and nothing is learned from it: so few
     pixels leave its pose open."""
+    first_measured: float = 0.1
+    """Share of pixels with depth below which a frame cannot begin a map, or a submap that hangs on nothing: what it
+    shows is all that is known at first."""
     residual: float = 0.024
     """Metres; a frame with a larger residual is lost, if also `noise` times the least of late is less. Frames that are
     tracked well have at most 18 mm, another room 18 to 30, the less the more often it is tried."""

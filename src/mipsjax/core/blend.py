@@ -38,7 +38,7 @@ def start(points: int, cfg: FieldConfig) -> Blended:
     return Blended(psi, entropy, jnp.zeros((points, 3)), jnp.zeros(points))
 
 
-@compiled("cfg", "colored")
+@compiled("cfg", "colored", reads=("field", "blend"))
 def add(
     total: Blended,
     field: nf.Field,

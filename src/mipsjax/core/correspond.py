@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Float32
 from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core.compiled import compiled
+from mipsjax.core.evidence import SATURATED
 from mipsjax.core.rigid import transform, transform_back
-from mipsjax.core.solvers import SATURATED
 
 
 class Surface(NamedTuple):
@@ -64,7 +64,7 @@ def fixed_size(
     return start, mask
 
 
-@compiled("cfg")
+@compiled("cfg", reads=("field", "correspond"))
 def surface_points(
     field: nf.Field, start: Float[Array, "N 3"], mask: Bool[Array, " N"], cfg: Config
 ) -> Surface:
@@ -80,7 +80,7 @@ def surface_points(
     return Surface(_where(good, there), _where(good, _unit(here.gradient)), good)
 
 
-@compiled("cfg")
+@compiled("cfg", reads=("field", "correspond"))
 def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg: Config) -> Matches:
     """Correspondences of submap j's surface points on submap k's surface (Eq. 19, by Newton steps).
 

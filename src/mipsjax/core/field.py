@@ -121,7 +121,8 @@ def classify(net: Net, encoded: Float[Array, "N E"], cfg: FieldConfig) -> Tsdf:
         # Bounded as the soft argmax is, so that the losses and the robust steps can stay the same
         psi = cfg.truncation * jnp.tanh(z[:, 0])
         return Tsdf(psi, jnp.ones_like(psi), psi[:, None])
-    z = jax.nn.softmax(z) if cfg.normalised else z
+    # Each by itself: numbers that sum to 1 saturate before the soft argmax (docs/method.md, b)
+    z = jax.nn.sigmoid(z) if cfg.normalised else z
     # By the logarithm: the entropy stays finite where a probability is 0 in single precision
     log_p = jax.nn.log_softmax(cfg.coldness * z)
     p = jnp.exp(log_p)

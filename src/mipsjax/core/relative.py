@@ -18,15 +18,9 @@ from mipsjax.core import losses
 from mipsjax.core.camera import Intrinsics, grid_shape, pixel_grid, unproject
 from mipsjax.core.compiled import compiled
 from mipsjax.core.equations import Points, Prior, descend, mean_precision, prior_system
+from mipsjax.core.evidence import Landmarks, as_independent, colour_systems, view_errors, view_rows
+from mipsjax.core.information import steady_hessian
 from mipsjax.core.photometric import Images, pyramid, with_noise
-from mipsjax.core.solvers import (
-    Landmarks,
-    as_independent,
-    colour_systems,
-    steady_hessian,
-    view_errors,
-    view_rows,
-)
 from mipsjax.core.views import Views, own_normals
 
 LEVELS = 2
@@ -75,7 +69,7 @@ class Relative(NamedTuple):
     """Share of the second frame's points that lie on surfaces of the first."""
 
 
-@compiled("camera", "cfg")
+@compiled("camera", "cfg", reads=("sensor", "track", "pairs"))
 def measure(pairs: Pairs, trust: Float[Array, ""], camera: Intrinsics, cfg: Config) -> Relative:
     """Robust second-order steps on point-to-plane distances, errors of corners in the image and differences of
     brightness, one pair after the other.

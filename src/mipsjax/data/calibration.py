@@ -79,6 +79,9 @@ class Options(NamedTuple):
     fps: float | None = None
     """Of a layout without times."""
     input: InputConfig = InputConfig()
+    depth_topic: str | None = None
+    """Of a bag that has several."""
+    color_topic: str | None = None
 
 
 class CameraFile(NamedTuple):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float64, UInt8, UInt16
+from jaxtyping import Float64, Num, UInt8, UInt16
 
 from mipsjax.data import images
 from mipsjax.data.images import ImageHeader
@@ -34,7 +34,7 @@ class FrameSource(Protocol):
 
     def color(self, position: int) -> tuple[UInt8[np.ndarray, "H W 3"] | None, str]: ...
 
-    def raw_depth(self, position: int) -> tuple[UInt16[np.ndarray, "H W"] | None, str]: ...
+    def raw_depth(self, position: int) -> tuple[Num[np.ndarray, "H W"] | None, str]: ...
 
     def color_header(self, position: int) -> ImageHeader | None: ...
 

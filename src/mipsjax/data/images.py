@@ -7,8 +7,12 @@ a damaged PNG, so both are checked here on the bytes first.
 
 from __future__ import annotations
 
+import os
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +33,9 @@ LARGEST_FILE_BYTES = 1 << 28
 """Of an image file."""
 _HEADER_BYTES = 65536
 """Enough for nearly all headers; some JPEGs carry more of thumbnails and profiles before their size."""
+
+_STDERR = 2  # where libraries print
+_ONE_AT_A_TIME = threading.Lock()  # who leads it elsewhere
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
@@ -121,14 +128,37 @@ def _decode(path: Path, flags: int, kind: str) -> tuple[np.ndarray | None, str]:
         return None, f"missing_{kind}: {path.name}"
     except OSError as error:
         return None, f"unreadable_{kind}: {path.name}: {error.strerror or error}"
+    return decoded(data, flags, kind, path.name)
+
+
+def decoded(data: bytes, flags: int, kind: str, name: str) -> tuple[np.ndarray | None, str]:
+    """Pixels of an image of `kind`, by OpenCV's `flags`, or None and `unreadable_<kind>: <name>: ...`."""
     damage = find_damage(data) or _beyond(data)
     if damage:
-        return None, f"unreadable_{kind}: {path.name}: {damage}"
+        return None, f"unreadable_{kind}: {name}: {damage}"
     try:
-        pixels = cv2.imdecode(np.frombuffer(_pixels_only(data), np.uint8), flags)
+        with _silent_decoders():
+            pixels = cv2.imdecode(np.frombuffer(_pixels_only(data), np.uint8), flags)
     except cv2.error:
         pixels = None
-    return pixels, "" if pixels is not None else f"unreadable_{kind}: {path.name}: cannot be decoded"
+    return pixels, "" if pixels is not None else f"unreadable_{kind}: {name}: cannot be decoded"
+
+
+@contextmanager
+def _silent_decoders() -> Iterator[None]:
+    """Leads what libjpeg prints of damaged data, past Python, to nowhere: a frame's problem is said by us."""
+    with _ONE_AT_A_TIME, ExitStack() as opened:
+        try:
+            before = os.dup(_STDERR)
+            opened.callback(os.close, before)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            opened.callback(os.close, nowhere)
+        except OSError:  # closed, or no file can be opened any more: then it prints
+            yield
+            return
+        os.dup2(nowhere, _STDERR)
+        opened.callback(os.dup2, before, _STDERR)
+        yield
 
 
 def _beyond(data: bytes) -> str:

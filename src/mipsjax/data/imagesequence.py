@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int, UInt8, UInt16
+from jaxtyping import Float32, Float64, Int, Num, UInt8
 
 from mipsjax.config.sections import InputConfig
 from mipsjax.core.camera import Intrinsics
@@ -124,7 +124,7 @@ class ImageSequence:
             return None, _wrong_size("color", _size(color), self.shape.color_size)
         return shape_color(color, self.shape), ""
 
-    def _raw_depth(self, place: int) -> tuple[UInt16[np.ndarray, "H W"] | None, str]:
+    def _raw_depth(self, place: int) -> tuple[Num[np.ndarray, "H W"] | None, str]:
         try:
             depth, problem = self.source.raw_depth(place)
         except InputError as error:
@@ -206,7 +206,7 @@ def shape_color(color: UInt8[np.ndarray, "H W 3"], shape: Shape) -> UInt8[np.nda
     return decimate_color(color, shape.every_px)
 
 
-def shape_depth(depth: UInt16[np.ndarray, "H W"], shape: Shape) -> UInt16[np.ndarray, "h w"]:
+def shape_depth(depth: Num[np.ndarray, "H W"], shape: Shape) -> Num[np.ndarray, "h w"]:
     """Undistorted and decimated by choosing pixels: a mean over an edge would be a point in the air."""
     if shape.maps is not None:
         depth = cv2.remap(depth, shape.maps.x, shape.maps.y, cv2.INTER_NEAREST)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mipsjax.config.sections import InputConfig
-from mipsjax.data import fastcamo, folder, replica, scannet, sevenscenes, tum
+from mipsjax.data import bag, fastcamo, folder, replica, scannet, sevenscenes, tum
 from mipsjax.data.calibration import DEPTH_UNITS, DepthScale, Options, declared_intrinsics
 from mipsjax.data.imagesequence import ImageSequence
 from mipsjax.data.sequence import Sequence
@@ -51,7 +51,7 @@ class Layout(NamedTuple):
 
 LAYOUTS = {
     module.LAYOUT: Layout(module.MARKERS, module.matches, module.read)
-    for module in (folder, tum, replica, scannet, sevenscenes, fastcamo)
+    for module in (folder, tum, replica, scannet, sevenscenes, fastcamo, bag)
 }
 
 
@@ -63,8 +63,10 @@ def open_sequence(
     depth_scale: float | None = None,
     frames: slice = slice(None),
     input: InputConfig = InputConfig(),  # noqa: B008 (frozen)
+    depth_topic: str | None = None,
+    color_topic: str | None = None,
 ) -> Sequence:
-    """Opens a folder, a `.seq` file or `synth:NAME`; no image is kept, nothing is written.
+    """Opens a folder, a `.seq` file, a bag or `synth:NAME`; no image is kept, nothing is written.
 
     Args:
         path: what to open.
@@ -73,6 +75,7 @@ def open_sequence(
         depth_scale: depth units per metre.
         frames: which frames, by their number.
         input: range of depth, working width.
+        depth_topic: of a bag with several; likewise `color_topic`.
 
     Raises:
         InputError: the sequence is unusable; the message says what to do.
@@ -82,7 +85,13 @@ def open_sequence(
         from mipsjax.data.synth import open_synth
 
         synthetic = open_synth(str(path).removeprefix(SYNTH_PREFIX), frames, input)
-        given = {"--layout": layout, "--intrinsics": intrinsics, "--depth-scale": depth_scale}
+        given = {
+            "--layout": layout,
+            "--intrinsics": intrinsics,
+            "--depth-scale": depth_scale,
+            "--depth-topic": depth_topic,
+            "--color-topic": color_topic,
+        }
         unused = [name for name, value in given.items() if value is not None]
         if unused:
             synthetic.notes += (f"{' and '.join(unused)} left out: {path} has its own",)
@@ -97,6 +106,8 @@ def open_sequence(
         intrinsics=None if intrinsics is None else declared_intrinsics(intrinsics),
         depth_scale=None if depth_scale is None else DepthScale(depth_scale, "--depth-scale"),
         input=input,
+        depth_topic=depth_topic,
+        color_topic=color_topic,
     )
     place = _require_path(Path(path))
     try:
@@ -108,7 +119,11 @@ def open_sequence(
         hint = "; make it readable, as by chmod -R u+rX" if isinstance(error, PermissionError) else ""
         what, why = error.filename or place, error.strerror or error
         raise InputError(f"{what}: cannot be read ({why}){hint}") from error
-    return sequence.with_notes(check_depth_scale(sequence) + suspicions(sequence))
+    notes = check_depth_scale(sequence) + suspicions(sequence)
+    given = {"--depth-topic": depth_topic, "--color-topic": color_topic}
+    if name != bag.LAYOUT and (unused := [option for option, topic in given.items() if topic]):
+        notes += (f"{' and '.join(unused)} left out: {place} is no bag",)
+    return sequence.with_notes(notes)
 
 
 def detect_layout(path: Path) -> str:
@@ -158,7 +173,7 @@ def suspicions(sequence: ImageSequence) -> tuple[str, ...]:
     assert depth is not None, "a frame of typical depth has one"
     units = sequence.depth_scale.units_per_metre
     found = suspicions_of_depth(depth, units, sequence.input.depth_max, int(sequence.numbers[position]))
-    if sequence.layout != tum.LAYOUT:  # others number their frames: their times are ours
+    if sequence.layout not in (tum.LAYOUT, bag.LAYOUT):  # others number their frames: their times are ours
         return found
     return found + suspicions_of_times(sequence.timestamps, sequence.numbers)
 
@@ -198,7 +213,7 @@ def describe(sequence: Sequence) -> str:
 
 
 def _require_path(path: Path) -> Path:
-    """The absolute path. Raises InputError unless it is a readable folder or a `.seq` file."""
+    """The absolute path. Raises InputError unless it is a readable folder, a `.seq` file or a bag."""
     try:
         if not path.exists():
             existing = next(parent for parent in path.absolute().parents if parent.exists())
@@ -206,7 +221,7 @@ def _require_path(path: Path) -> Path:
         if path.is_dir():
             # A folder that may not be read fails here, and not within a reader
             next(path.iterdir(), None)
-        elif not fastcamo.matches(path):
+        elif not (fastcamo.matches(path) or bag.matches(path)):
             raise InputError(f"{path}: is a file, a folder is expected")
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror or error})") from error

@@ -119,7 +119,7 @@ def read_associations(path: Path) -> Listing:
 def camera_from_name(path: Path) -> Calibration | None:
     """The camera named in a path, such as `freiburg2` or `fr2`; the innermost folder decides."""
     parts = reversed(path.parts)
-    found = (re.findall(_CAMERA_NAME, part.replace("_", " ")) for part in parts)
+    found = (re.findall(_CAMERA_NAME, part) for part in parts)
     return next((CAMERAS[digits[0]] for digits in found if digits), None)
 
 

@@ -67,7 +67,7 @@ def ransac(pairs: Pairs, seed: int) -> Pose | None:
     return T[np.argmax(support)]
 
 
-def refine(pairs: Pairs, T_other_current: Pose) -> tuple[Pose, Bool[np.ndarray, "M"]]:
+def by_inliers(pairs: Pairs, T_other_current: Pose) -> tuple[Pose, Bool[np.ndarray, "M"]]:
     """Gauss-Newton on the residuals of the inliers with Cauchy weights; the motion, and which pairs fit it."""
     T = T_other_current
     for _ in range(REFINEMENTS):

@@ -65,9 +65,9 @@ def relative_pose(current: Features, other: Features, camera: Intrinsics, seed: 
     found = ransac.ransac(pairs, seed)
     if found is None:
         return _nothing(len(pairs.p_current))
-    T, _ = ransac.refine(pairs, found)
+    T, _ = ransac.by_inliers(pairs, found)
     pairs = _pairs(current, other, match_near(current, other, T))
-    T, inlier = ransac.refine(pairs, T)
+    T, inlier = ransac.by_inliers(pairs, T)
     if not inlier.any():
         return _nothing(len(pairs.p_current))
     kept = Pairs(*(p[inlier] for p in pairs))

@@ -84,10 +84,10 @@ class Caster:
         depth = np.zeros(height * width, np.float32)
         for rows, directions in _pixel_rays(intrinsics):
             # Not made unit vectors: z is 1 in the camera, so that multiples of them are z-depths
-            rays = directions @ T_world_cam[:3, :3].T
-            hits = self._cast(np.broadcast_to(T_world_cam[:3, 3], rays.shape), rays)
+            in_world = directions @ T_world_cam[:3, :3].T
+            hits = self._cast(np.broadcast_to(T_world_cam[:3, 3], in_world.shape), in_world)
             lamp = T_world_cam[:3, :3] @ LAMP_CAM if shaded else None
-            color[rows] = self._shade(hits, rays, lamp, background)
+            color[rows] = self._shade(hits, in_world, lamp, background)
             depth[rows] = hits.depth
         return Render(color.reshape(height, width, 3), depth.reshape(height, width))
 

@@ -42,6 +42,8 @@ class FrameInfo(NamedTuple):
     world_deviation_m: float = 0.0
     """Standard deviation of where the camera was relative to where the map began, as the frame came; after a loop that
     it closed, which its status is not."""
+    full: bool = False
+    """Another submap would have begun with it, but for `volume.max_submaps`."""
     note: str = ""
 
 

@@ -7,7 +7,7 @@ import logging
 import numpy as np
 
 from mipsjax.config.sections import Config, SensorConfig
-from mipsjax.submaps.state import SlamState, Status, thumbnail_stride, to_metres, world_pose
+from mipsjax.submaps.state import SlamState, thumbnail_stride, to_metres, world_pose
 from mipsjax.uncertainty.agreement import LIMIT, MOST_VIEWS, Agreement, Noise, Part, Views, agreement
 
 log = logging.getLogger(__name__)
@@ -16,8 +16,9 @@ log = logging.getLogger(__name__)
 def judged(state: SlamState, cfg: Config) -> Agreement | None:
     """What the small depth images of trusted frames say about the run, with indices of `state.records`; None where too
     few see the same. Warns where they contradict each other. No ground truth is needed."""
-    trusted = [i for i, r in enumerate(state.records) if r.status in (Status.OK, Status.WEAK)]
-    seen = [i for i in trusted if state.records[i].depth is not None]
+    # What has moved between two recordings contradicts neither
+    own = range(state.first, len(state.records))
+    seen = [i for i in own if state.records[i].status.trusted and state.records[i].depth is not None]
     # Evenly over the run, so that what was seen late is compared with what was seen early
     indices = seen[:: max(1, -(-len(seen) // MOST_VIEWS))]
     if not indices:

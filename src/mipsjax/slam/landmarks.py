@@ -9,11 +9,12 @@ import numpy as np
 
 from mipsjax.config.sections import Config
 from mipsjax.core.camera import Intrinsics
+from mipsjax.core.evidence import Landmarks
 from mipsjax.core.photometric import Images
 from mipsjax.core.rigid import inverse, transform
-from mipsjax.core.solvers import Landmarks
 from mipsjax.data.sequence import Frame
-from mipsjax.images.corners import Corners, Followed, corners, decimated, follow, grey_of
+from mipsjax.images.corners import Corners, corners, decimated, grey_of
+from mipsjax.images.following import Followed, follow
 from mipsjax.submaps.links import best_link
 from mipsjax.submaps.state import Pose, SlamState, pose_of
 
@@ -83,10 +84,13 @@ def landmarks(found: list[Seen], frames: int, camera: Intrinsics, cfg: Config) -
     axes, mask = np.zeros((size, 2, 2), np.float32), np.zeros(size, bool)
     begin = 0
     for seen in found:
-        end = begin + len(seen.followed.pixel)
-        p_sub[begin:end] = transform(seen.T_sub_ref, seen.followed.p_ref)
-        ray[begin:end] = (seen.followed.pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        axes[begin:end] = seen.followed.axes
+        # A map may have been learned with more of them
+        strongest = slice(0, cfg.track.corners.count)
+        pixel = seen.followed.pixel[strongest]
+        end = begin + len(pixel)
+        p_sub[begin:end] = transform(seen.T_sub_ref, seen.followed.p_ref[strongest])
+        ray[begin:end] = (pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        axes[begin:end] = seen.followed.axes[strongest]
         mask[begin:end] = True
         begin = end
     return Landmarks(*(jnp.asarray(part) for part in (p_sub, ray, axes, mask)))

@@ -42,6 +42,12 @@ class FrameStats(NamedTuple):
     step_rotation: float
     """Radians from the last frame."""
 
+    @property
+    def said(self) -> str:
+        """In words, how a lost frame fits the map."""
+        residual_mm = 1e3 * self.residual
+        return f"known {self.known:.2f}, confirmed {self.confirmed:.2f}, residual {residual_mm:.0f} mm"
+
 
 class Decision(NamedTuple):
     """What is done with it."""

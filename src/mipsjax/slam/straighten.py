@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 
 from mipsjax.config.sections import Config
 from mipsjax.core import relative
+from mipsjax.core.evidence import Landmarks
 from mipsjax.core.rigid import angles, inverse, rigid
-from mipsjax.core.solvers import Landmarks
-from mipsjax.images.corners import follow
+from mipsjax.images.following import follow
 from mipsjax.loops.factors import RelativePose
 from mipsjax.slam.landmarks import Seen, images_of, landmarks
 from mipsjax.submaps.bundle import nearest
@@ -81,7 +81,8 @@ def straightened(state: SlamState, cfg: Config) -> tuple[SlamState, float]:
     if trust < 1:
         measured = _measured(nodes, pairs, trust, state, cfg)
     factors = list(_pair_factors(pairs, measured, cfg))
-    factors += _as_tracked(poses, {factor.second for factor in factors}, cfg)
+    begins = next((i for i, keyframe_id in enumerate(ids) if keyframe_id >= state.first), 0)
+    factors += _as_tracked(poses, {factor.second for factor in factors}, begins, cfg)
     factors += _link_factors(state, ids, cfg)
     solved = _solved(poses, factors)
     if solved is None:
@@ -225,12 +226,16 @@ def _covariance(information: ArrayLike) -> Float64[np.ndarray, "6 6"] | None:
 
 
 def _as_tracked(
-    poses: Float64[np.ndarray, "N 4 4"], measured: set[int], cfg: Config
+    poses: Float64[np.ndarray, "N 4 4"], measured: set[int], begins: int, cfg: Config
 ) -> Iterator[RelativePose]:
-    """Keyframes that no pair joins to an earlier one stay where they are beside the one before."""
+    """Keyframes that no pair joins to an earlier one stay where they are beside the one before; the first of this
+    recording, of index `begins`, beside the nearest, since nothing tracked the camera from an earlier one to it."""
     for second in sorted(set(range(1, len(poses))) - measured):
-        between = inverse(poses[second - 1]) @ poses[second]
-        yield RelativePose(second - 1, second, between, cfg.loop.sigma_rotation, cfg.loop.sigma)
+        first = second - 1
+        if second == begins:
+            first = int(np.argmin(np.linalg.norm(poses[:second, :3, 3] - poses[second, :3, 3], axis=1)))
+        between = inverse(poses[first]) @ poses[second]
+        yield RelativePose(first, second, between, cfg.loop.sigma_rotation, cfg.loop.sigma)
 
 
 def _link_factors(state: SlamState, ids: list[RecordId], cfg: Config) -> Iterator[RelativePose]:

@@ -15,15 +15,17 @@ from mipsjax.data.sequence import Frame
 from mipsjax.images.corners import Corners
 from mipsjax.slam.landmarks import Seen, corners_of, follow_all, images_of, landmarks, placed
 from mipsjax.slam.policy import converged, widening
-from mipsjax.submaps.bundle import TRACK, nearest, random_key, views_of
+from mipsjax.submaps.astray import ANYWHERE
+from mipsjax.submaps.bundle import nearest, views_of
+from mipsjax.submaps.chance import Purpose, key_for
 from mipsjax.submaps.state import (
     Keyframe,
     Pose,
     Record,
     SlamState,
-    Status,
     deviations_of,
     last_pose,
+    last_trusted,
 )
 from mipsjax.uncertainty.held import (
     NONE,
@@ -40,7 +42,6 @@ from mipsjax.uncertainty.held import (
 from mipsjax.uncertainty.trust import ALLOWED_TRACKED, Differing, differing, trusted
 
 DT_MIN = 1e-3  # seconds; two stamps nearer than this count as this far apart
-TRUSTED = (Status.OK, Status.WEAK)
 DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated further
 
 
@@ -69,10 +70,11 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     """A frame with depth, from where its corners or the motion before it say that it is."""
     assert frame.depth is not None
     began = perf_counter()
-    # Compiled code takes an image in any case; to a black one `images_of` gives none to compare it with
+    # Compiled code takes an image in any case; a black one that stands for none counts for nothing
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
-    earlier, trust = 1 + cfg.track.corners.keyframes, trusted(state.doubts, ALLOWED_TRACKED)
+    earlier = 1 + cfg.track.corners.keyframes
+    trust = 0.0 if frame.color is None else trusted(state.doubts, ALLOWED_TRACKED)
     T_as_before = candidates[0]
     found = follow_all(state, frame, T_as_before, cfg)
     if found:
@@ -84,7 +86,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         color,
         np.stack(candidates).astype(np.float32),
         np.float32(widening(state.frames_in_trouble, cfg)),
-        random_key(cfg, TRACK, len(state.records)),
+        key_for(cfg, Purpose.TRACK, state.next_record),
         state.camera,
         cfg,
         # Evenly over the list: its first is the anchor while that is near, and the pose of that is exact
@@ -121,7 +123,9 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
 def coasting(state: SlamState, frame: Frame, cfg: Config) -> Held:
     """How far a frame may be off that nothing is measured of, and that is taken to be where the last one was."""
     last, T_sub_cam = state.records[-1], last_pose(state)
-    if last.status in TRUSTED:
+    if not state.located:
+        return at(ANYWHERE, T_sub_cam)
+    if last.status.trusted:
         # Its motion is forgotten: a frame that is taken to stand still says nothing of one
         last = last._replace(held=at(last.held.covariance, T_sub_cam))
     return _predicted(None, last, frame, T_sub_cam, cfg)
@@ -203,8 +207,3 @@ def _candidates(state: SlamState, timestamp: float) -> list[Pose]:
     further = min(max(ratio, 0.0), DT_RATIO_MAX) * to_twist(state.motion.T_older_newer)
     moved = last @ from_twist(further)
     return [moved, last] if ratio <= DT_RATIO_MAX else [last, moved]
-
-
-def last_trusted(state: SlamState) -> Record:
-    """The newest frame whose pose was measured."""
-    return next(r for r in reversed(state.records) if r.status in TRUSTED)

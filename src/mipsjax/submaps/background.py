@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from functools import partial
 
-import jax
-
 from mipsjax.config.sections import Config
 from mipsjax.core.camera import Intrinsics
-from mipsjax.submaps.bundle import BACKGROUND, adjust_submap, adjust_submaps, choose, random_key
+from mipsjax.submaps.bundle import adjust_submap, adjust_submaps, choose
+from mipsjax.submaps.chance import Purpose, generator_for, key_for
 from mipsjax.submaps.dormant import packed
 from mipsjax.submaps.ids import SubmapId
 from mipsjax.submaps.schedule import Executor
@@ -38,7 +37,7 @@ def refine_inactive(state: SlamState, cfg: Config, executor: Executor) -> SlamSt
     places = turn(number, state.active, len(state.submaps), cfg)
     if not places:
         return state
-    state = taken_over(state, executor, cfg)
+    state = with_refined(state, executor, cfg)
     refinement = Refinement(places, tuple(state.submaps[place] for place in places), number)
     executor.start(partial(refined, camera=state.camera, cfg=cfg), refinement)
     return state._replace(refinement=refinement)
@@ -49,10 +48,10 @@ def refined(refinement: Refinement, camera: Intrinsics, cfg: Config) -> list[Sub
     places, submaps, number = refinement
     work, others = cfg.background, cfg.map.frames - 1
     chosen = [
-        choose(submap, others, (cfg.seed, BACKGROUND, number, place))
+        choose(submap, others, generator_for(cfg, Purpose.BACKGROUND_KEYFRAMES, number, place))
         for submap, place in zip(submaps, places, strict=True)
     ]
-    keys = [jax.random.fold_in(random_key(cfg, BACKGROUND, number), place) for place in places]
+    keys = [key_for(cfg, Purpose.BACKGROUND, number, place) for place in places]
     # One alone goes by what is compiled for the active submap
     if len(submaps) == 1:
         (submap,), (some,), (key,) = submaps, chosen, keys
@@ -64,7 +63,7 @@ def refined(refinement: Refinement, camera: Intrinsics, cfg: Config) -> list[Sub
     return [submap._replace(learned=packed(submap.learned)) for submap in after]
 
 
-def taken_over(state: SlamState, executor: Executor, cfg: Config) -> SlamState:
+def with_refined(state: SlamState, executor: Executor, cfg: Config) -> SlamState:
     """With the result of the refinement under way, if there is one.
 
     Keyframes that were added or dropped meanwhile stay so.

@@ -10,22 +10,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from mipsjax.config.sections import Config
-from mipsjax.core import mapping
+from mipsjax.core import draws, mapping
 from mipsjax.core.camera import Intrinsics, unproject
 from mipsjax.core.rigid import distance, rigid, transform
 from mipsjax.core.views import Views
 from mipsjax.data.sequence import Frame
+from mipsjax.submaps.chance import Purpose, generator_for
 from mipsjax.submaps.dormant import unpacked
 from mipsjax.submaps.ids import RecordId
 from mipsjax.submaps.state import Keyframe, Pose, Submap
-
-# Purposes of random draws: a draw added in one place moves no other.
-INIT, TRACK, MAP, CHOOSE, FINISH, BACKGROUND, MATCH = range(7)
-
-
-def random_key(cfg: Config, purpose: int, number: int) -> jax.Array:
-    """The key of one purpose at one frame; `number` is the id of the frame's record."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(cfg.seed), purpose), number)
 
 
 def mapping_stride(camera: Intrinsics, cfg: Config) -> int:
@@ -80,11 +73,16 @@ def nearest(keyframes: Sequence[Keyframe], T_sub_cam: Pose, count: int) -> list[
     return [ordered[i % len(ordered)] for i in range(count)]
 
 
-def choose(submap: Submap, others: int, seed: tuple[int, ...]) -> list[int]:
+def random_batch(count: int, cfg: Config, purpose: Purpose, *numbers: int) -> list[int]:
+    """The places of as many of `count` keyframes as mapping is compiled for: of fewer some are drawn twice."""
+    rng = generator_for(cfg, purpose, *numbers)
+    return [int(i) for i in rng.choice(count, cfg.map.frames, replace=count < cfg.map.frames)]
+
+
+def choose(submap: Submap, others: int, rng: np.random.Generator) -> list[int]:
     """Indices, in a submap's keyframes, of the anchor and of `others` random ones; the anchor again where there are too
     few."""
     count = len(submap.keyframes)
-    rng = np.random.default_rng(seed)
     chosen = rng.choice(np.arange(1, count), min(others, count - 1), replace=False) if count > 1 else []
     picked = [0, *(int(i) for i in chosen)]
     return picked + [0] * (1 + others - len(picked))
@@ -168,8 +166,8 @@ def _batch(submap: Submap, chosen: list[int], share: float) -> tuple[list[Keyfra
     return [submap.keyframes[i] for i in chosen], [share if i != 0 else 0.0 for i in chosen]
 
 
-def _frames(batch: list[Keyframe], rates: list[float]) -> mapping.Frames:
-    return mapping.Frames(
+def _frames(batch: list[Keyframe], rates: list[float]) -> draws.Frames:
+    return draws.Frames(
         depth=jnp.asarray(np.stack([k.depth for k in batch])),
         color=jnp.asarray(np.stack([k.color for k in batch])),
         T_sub_cam=jnp.asarray(np.stack([k.T_sub_cam for k in batch]), jnp.float32),

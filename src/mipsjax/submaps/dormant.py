@@ -39,6 +39,11 @@ def unpacked(learned: Learned) -> Learned:
     return learned._replace(optimizer=jax.tree.map(_unpack, learned.optimizer, is_leaf=_is_packed))
 
 
+def rests(learned: Learned) -> bool:
+    """Whether any of it is packed."""
+    return any(_is_packed(leaf) for leaf in jax.tree.leaves(learned.optimizer, is_leaf=_is_packed))
+
+
 # On the host, where nothing is compiled for it
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from mipsjax.config.sections import Config
 from mipsjax.images.features import Features, similar
 from mipsjax.loops.registration import Match, relative_pose
-from mipsjax.submaps.bundle import MATCH
+from mipsjax.submaps.chance import Purpose, generator_for
 from mipsjax.submaps.ids import RecordId, SubmapId
 from mipsjax.submaps.proposals import Expected, Sighting, sight
 from mipsjax.submaps.state import Keyframe, SlamState
@@ -34,7 +32,7 @@ def recognise(
     database = [features for _, _, features in candidates]
     for i in similar(keyframe.features, database, cfg.loop.candidates):
         submap_id, other, features = candidates[i]
-        seed = int(np.random.default_rng((cfg.seed, MATCH, keyframe.id, i)).integers(2**31))
+        seed = int(generator_for(cfg, Purpose.MATCH, keyframe.id, i).integers(2**31))
         match = relative_pose(keyframe.features, features, state.camera, seed)
         if not match.ok:
             continue

@@ -49,7 +49,7 @@ from mipsjax.submaps.state import (
 from mipsjax.uncertainty.held import Held
 from mipsjax.uncertainty.trust import Differing
 
-FORMAT = 2
+FORMAT = 3
 """Rises when what is written changes, so that no file is read as what it is not."""
 MANIFEST = "manifest"
 DATE = (1980, 1, 1, 0, 0, 0)

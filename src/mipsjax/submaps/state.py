@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import jax
@@ -45,6 +46,11 @@ class Status(Word):
     """Not mapped; its pose is the last trusted one."""
     SKIPPED = 3
     """No usable image; its pose is the last trusted one."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the pose of such a frame was measured."""
+        return self in (Status.OK, Status.WEAK)
 
 
 class How(Word):
@@ -130,7 +136,7 @@ class Record(NamedTuple):
     depth: UInt16[np.ndarray, "h w"] | None = None
     """A small picture of the depth, in units of `THUMBNAIL_UNIT`, to align the frame to the finished map with."""
     colour: Matrix = NONE
-    """How firmly corners and brightness of the image held it then (`core/solvers.py: Information`)."""
+    """How firmly corners and brightness of the image held it then (`core/information.py: Information`)."""
     is_keyframe: bool = False
     """It was made a keyframe of its submap."""
 
@@ -196,6 +202,15 @@ class SlamState(NamedTuple):
     """How colour and surfaces of frames of late differ, by which colour is trusted."""
     residual: float = 0.0
     """Metres; the least that trusted frames end at of late, which is the sensor's noise; 0 at the start."""
+    good: mapping.Learned | None = None
+    """What the active submap had learned when its last steps came out finite; None where there were none since it took
+    over (`submaps/mending.py`)."""
+    trusted: RecordId = RecordId(0)
+    """The newest frame whose pose was measured."""
+    first: RecordId = RecordId(0)
+    """The first frame of this recording; those before it are of recordings from which the map was learned earlier."""
+    older_loops: int = 0
+    """How many of the loops are of those."""
 
     @property
     def submap(self) -> Submap:
@@ -212,6 +227,16 @@ class SlamState(NamedTuple):
         """The id that the next processed frame gets."""
         return RecordId(len(self.records))
 
+    @property
+    def located(self) -> bool:
+        """Whether it is known where the camera is: not so before it was found in a map of earlier recordings."""
+        return self.trusted >= self.first
+
+    def with_record(self, record: Record) -> SlamState:
+        """The state after one more frame."""
+        trusted = self.next_record if record.status.trusted else self.trusted
+        return self._replace(records=self.records.appended(record), trusted=trusted)
+
     def with_submap(self, submap_id: SubmapId, **fields: Any) -> SlamState:
         """The state with fields of one submap replaced."""
         submaps = list(self.submaps)
@@ -223,6 +248,11 @@ def pose_of(state: SlamState, record: Record) -> Pose:
     """Camera-to-submap pose of a frame, in its own submap."""
     keyframe = state.submaps[record.submap].keyframe_of(record.keyframe)
     return keyframe.T_sub_cam @ record.T_keyframe_cam
+
+
+def last_trusted(state: SlamState) -> Record:
+    """The newest frame whose pose was measured."""
+    return state.records[state.trusted]
 
 
 def last_pose(state: SlamState) -> Pose:
@@ -241,8 +271,13 @@ def world_pose(state: SlamState, record: Record) -> Pose:
 
 
 def trajectory(state: SlamState) -> Float64[np.ndarray, "N 4 4"]:
-    """World pose of every processed frame, camera-to-world."""
-    return np.stack([world_pose(state, record) for record in state.records])
+    """World pose of every processed frame of this recording, camera-to-world; NaN before it was found in a map of
+    earlier ones."""
+    records = state.records[state.first :]
+    unknown = list(takewhile(lambda record: not record.status.trusted, records)) if state.first else []
+    poses = [np.full((4, 4), np.nan)] * len(unknown)
+    poses += [world_pose(state, record) for record in records[len(unknown) :]]
+    return np.array(poses).reshape(-1, 4, 4)
 
 
 def keyframes(state: SlamState) -> int:

@@ -11,8 +11,9 @@ from mipsjax.core import mapping, volume
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.rigid import inverse, transform
 from mipsjax.submaps.astray import begun_at
-from mipsjax.submaps.bundle import INIT, MAP, adjust, adjust_submap, choose, mapping_camera, random_key
-from mipsjax.submaps.dormant import packed, unpacked
+from mipsjax.submaps.bundle import adjust, adjust_submap, choose, mapping_camera
+from mipsjax.submaps.chance import Purpose, generator_for, key_for
+from mipsjax.submaps.dormant import packed, rests, unpacked
 from mipsjax.submaps.ids import RecordId, SubmapId
 from mipsjax.submaps.proposals import Proposal
 from mipsjax.submaps.state import Keyframe, Pose, SlamState, Submap, pose_of
@@ -20,6 +21,7 @@ from mipsjax.uncertainty.held import NONE, at, carried, difference
 
 STAY, NEW = SubmapId(-1), SubmapId(-2)  # instead of a submap: the active one stays, a new one begins
 NOT_FINITE = "first fit of a new submap not finite, not entered"
+FULL = "no other submap may begin (--volume.max-submaps)"
 REVISIT_NOT_FINITE = "steps on the shared frame not finite, left out"
 
 
@@ -31,10 +33,10 @@ def begin(
     Returns it and whether its first fit stayed finite.
     """
     keyframes = (anchor._replace(T_sub_cam=np.eye(4)), *support)
-    learned = mapping.create(random_key(cfg, INIT, anchor.id), cfg)
+    learned = mapping.create(key_for(cfg, Purpose.NETWORKS, anchor.id), cfg)
     # Filled up to the number of frames that mapping is compiled for
     batch = [keyframes[i % len(keyframes)] for i in range(cfg.map.frames)]
-    key = random_key(cfg, MAP, anchor.id)
+    key = key_for(cfg, Purpose.FIRST_FIT, anchor.id)
     learned, _, ok = adjust(learned, batch, [0.0] * len(batch), steps, key, camera, cfg)
     box = volume.grow(None, *_seen(keyframes[0], camera, cfg), cfg.volume)
     return Submap(learned, box, keyframes, T_world_sub), ok
@@ -80,11 +82,18 @@ def govern(state: SlamState, found: Sequence[Proposal], cfg: Config) -> SubmapId
 def enter(state: SlamState, choice: SubmapId, cfg: Config) -> tuple[SlamState, str]:
     """The state in which the submap is active that `govern` chose, and what went wrong with it, if anything.
 
-    A new submap whose first fit is not finite is not entered: the state is as it was.
+    Where no other submap may begin, or its first fit is not finite, the state is as it was.
     """
     if choice == STAY:
         return state, ""
+    if choice == NEW and full(state, cfg):
+        return state, FULL
     return _begin_here(state, cfg) if choice == NEW else _revisit(state, choice, cfg)
+
+
+def full(state: SlamState, cfg: Config) -> bool:
+    """Whether the map has as many submaps as it may."""
+    return 0 < cfg.volume.max_submaps <= len(state.submaps)
 
 
 def _begin_here(state: SlamState, cfg: Config) -> tuple[SlamState, str]:
@@ -121,8 +130,9 @@ def _revisit(state: SlamState, submap_id: SubmapId, cfg: Config) -> tuple[SlamSt
     newest, shared = len(submap.keyframes) - 1, submap.keyframes[-1].id
     if cfg.map.revisit_steps:
         known = submap._replace(keyframes=submap.keyframes[:-1])
-        others = choose(known, cfg.map.frames - 2, (cfg.seed, INIT, shared))
-        share, key = cfg.map.pose_rate_slow, random_key(cfg, MAP, shared)
+        rng = generator_for(cfg, Purpose.REVISIT_KEYFRAMES, shared)
+        others = choose(known, cfg.map.frames - 2, rng)
+        share, key = cfg.map.pose_rate_slow, key_for(cfg, Purpose.REVISIT, shared)
         chosen, steps = [newest, *others], cfg.map.revisit_steps
         # Steps that are not finite leave the submap as it was, which is fit to be entered
         submap, ok = adjust_submap(submap, chosen, share, steps, key, state.camera, cfg)
@@ -147,7 +157,15 @@ def activated(state: SlamState, submap_id: SubmapId) -> SlamState:
         return state
     state = state.with_submap(state.active, learned=packed(state.submap.learned))
     entered = unpacked(state.submaps[submap_id].learned)
-    return state.with_submap(submap_id, learned=entered)._replace(active=submap_id)
+    # What was good is of the submap that is left
+    return state.with_submap(submap_id, learned=entered)._replace(active=submap_id, good=None)
+
+
+def awake(state: SlamState) -> SlamState:
+    """The state whose active submap can learn, whoever made it the active one."""
+    if not rests(state.submap.learned):
+        return state
+    return state.with_submap(state.active, learned=unpacked(state.submap.learned))
 
 
 def _seen(keyframe: Keyframe, camera: Intrinsics, cfg: Config) -> tuple[np.ndarray, np.ndarray]:
