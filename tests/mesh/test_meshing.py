@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from mipsjax.errors import OutputError
 from mipsjax.mesh import lattice, meshing
-from mipsjax.mesh.ply import export_ply
+from mipsjax.mesh.ply import export_ply, restore_uncertainty
 
 VOXEL = 0.02
 RADIUS = 0.83
@@ -170,8 +170,17 @@ def test_colour_and_uncertainty_belong_to_their_vertices(tmp_path):
     np.testing.assert_array_equal(read.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     np.testing.assert_array_equal(read.visual.vertex_colors, mesh.visual.vertex_colors)
-    raw = read.metadata["_ply_raw"]["vertex"]["data"]["uncertainty"]
-    np.testing.assert_array_equal(raw, mesh.vertex_attributes["uncertainty"])
+    restore_uncertainty(read)
+    np.testing.assert_array_equal(
+        read.vertex_attributes["uncertainty"], mesh.vertex_attributes["uncertainty"]
+    )
+
+
+def test_a_mesh_of_another_program_has_no_uncertainty(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    read = trimesh.load_mesh(tmp_path / "box.ply", process=False)
+    restore_uncertainty(read)
+    assert "uncertainty" not in read.vertex_attributes
 
 
 def test_same_bytes_twice_and_for_shuffled_points(tmp_path):

@@ -24,6 +24,7 @@ from mipsjax.data.textfile import content_lines
 from mipsjax.data.trajectory import Trajectory, read_matrix_rows, read_tum
 from mipsjax.errors import ConfigError, InputError
 from mipsjax.files import write_atomically
+from mipsjax.mesh.ply import restore_uncertainty
 from mipsjax.metrics import surface
 from mipsjax.metrics.poses import AbsoluteError, absolute_error, relative_error, translation_error
 
@@ -214,7 +215,7 @@ def read_trajectory(path: Path, fps: float | None = None) -> Poses:
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
-    """Reads one triangle mesh.
+    """Reads one triangle mesh, with its `uncertainty` where it is a PLY of a run.
 
     Raises:
         InputError: the file is missing or holds no mesh.
@@ -231,6 +232,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: holds no triangles")
+    restore_uncertainty(mesh)
     return mesh
 
 

@@ -35,6 +35,17 @@ def export_ply(path: Path, mesh: trimesh.Trimesh) -> None:
     write_atomically(Path(path), _ply_header(vertex, face) + vertex.tobytes() + face.tobytes())
 
 
+def restore_uncertainty(mesh: trimesh.Trimesh) -> None:
+    """Makes `uncertainty` an attribute of the vertices again in a mesh that trimesh read from a PLY.
+
+    trimesh keeps properties that it does not know apart, as they were in the file. A mesh without it stays as it is.
+    """
+    vertex = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = getattr(getattr(vertex, "dtype", None), "names", None) or ()
+    if "uncertainty" in names and len(vertex) == len(mesh.vertices):
+        mesh.vertex_attributes["uncertainty"] = np.asarray(vertex["uncertainty"], np.float32).reshape(-1)
+
+
 def _vertex_type(with_uncertainty: bool, far: bool) -> np.dtype:
     position = "<f8" if far else "<f4"
     fields = [(name, position) for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
