@@ -29,10 +29,11 @@ RESULTS = {
 }  # fmt: skip
 
 PUBLIC = {
-    "PRESETS", "Config", "ConfigError", "Frame", "FrameInfo", "Frames", "InputError", "Intrinsics", "Learned",
-    "MipsjaxError", "OutputError", "Sequence", "SlamState", "Status", "Submap", "TrackingLostError", "Views", "color",
-    "create", "finish", "fitness", "load", "open_sequence", "preset", "reconstruct_mesh", "refine", "save", "start",
-    "step", "track", "trajectory", "tsdf", "validate",
+    "PRESETS", "Blended", "Config", "ConfigError", "Frame", "FrameInfo", "Frames", "InputError", "Intrinsics",
+    "Learned", "MipsjaxError", "OutputError", "Sequence", "SlamState", "Status", "Submap", "TrackingLostError",
+    "Views", "blend", "blend_of_none", "color", "continued", "create", "finish", "fitness", "init", "load",
+    "localise", "open_sequence", "preset", "reconstruct_mesh", "refine", "save", "start", "step", "track",
+    "trajectory", "tsdf", "validate",
 }  # fmt: skip
 
 

@@ -73,7 +73,8 @@ def contents(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def test_every_layout_has_a_writer_here() -> None:
-    assert WRITERS.keys() == LAYOUTS.keys()
+    # A bag is written, and read, in test_bag.py
+    assert WRITERS.keys() | {"bag"} == LAYOUTS.keys()
 
 
 @pytest.mark.parametrize("name", WRITERS)

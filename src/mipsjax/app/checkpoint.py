@@ -241,7 +241,7 @@ def _file(path: Path) -> list[Any]:
     """Its name, size and time; only the name of one that cannot be read, which is a bad frame."""
     try:
         found = path.stat()
-    except OSError:
+    except (OSError, ValueError):  # the name may hold a NUL
         return [path.name]
     return [path.name, found.st_size, found.st_mtime_ns]
 
