@@ -183,6 +183,8 @@ def _cell(value: Any) -> Any:
         return int(value)
     if isinstance(value, float):
         return f"{value:.6g}" if math.isfinite(value) else ""
+    if isinstance(value, str):  # the name of a file may hold anything
+        return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in value)
     return value
 
 
