@@ -11,7 +11,8 @@ Groups: `large`, recordings of the development data; `homes`, ten homes drawn fr
 nobody tuned, slow and fast; `tuning`, others that one may look at; `loops`, where a place is seen again and where it is
 not; `rooms` and `kitchen`, earlier figures; `blind`, images made flat, so that surfaces alone hold the camera;
 `wrong-depth`, depth that is not what a sequence says, measured along the ray or in whole metres, of which a run must
-say so; `colour`, colour in tracking switched off and on; `no-pairs`, keyframes not measured against each other after
+say so; `colour`, colour in tracking switched off and on; `moving`, somebody who walks through the view, left out
+and, for comparison, left in; `no-pairs`, keyframes not measured against each other after
 the last frame.
 
 Errors are of the trajectory as it is written; those of columns that begin with `online` are of each pose as it was when
@@ -72,6 +73,7 @@ FAR_M, NEAR_M = 0.2, 0.05
 SAMPLES = 300_000
 OFF_M = 0.3
 """A frame farther off than this, and yet `ok`, was wrong without a word."""
+WALK_FRAMES = 30
 FLAT = 128
 """Grey of an image that shows nothing."""
 RESULTS = ROOT / "docs"
@@ -116,6 +118,11 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
     if group == "wrong-depth":
         switches = product(large, ("along-ray", "whole-metres"), seeds)
         return [Task(group, name, switch=switch, seed=seed) for name, switch, seed in switches]
+    if group == "moving":
+        switches = product(
+            (("small_house/living", 1), ("redkitchen", 4)), ("walker", "walker-left-in"), seeds
+        )
+        return [Task(group, *name, switch=switch, seed=seed) for name, switch, seed in switches]
     if group == "no-pairs":
         names = (("bookstore", 1), ("corridor_walk", 1), ("small_house/living", 1), ("redkitchen", 8))
         return [Task(group, *name, switch="no-pairs", seed=seed) for name, seed in product(names, seeds)]
@@ -135,6 +142,7 @@ GROUPS = (
     "blind",
     "wrong-depth",
     "colour",
+    "moving",
     "no-pairs",
 )
 
@@ -162,7 +170,32 @@ def in_whole_metres(sequence: Sequence, place: int) -> Frame:
     return frame if frame.depth is None else frame._replace(depth=np.round(frame.depth))
 
 
-ALTERED = {"flat": flat, "along-ray": along_the_ray, "whole-metres": in_whole_metres}
+def crossed(sequence: Sequence, place: int) -> Frame:
+    """With somebody who walks through the view again and again: a quarter of its width, from one to one and a half
+    metres away, in a second of 30 frames, after each of which there is nobody for a second."""
+    frame, camera = sequence[place], sequence.intrinsics
+    crossing, step = divmod(place, 2 * WALK_FRAMES)
+    if frame.depth is None or frame.color is None or step < WALK_FRAMES or crossing == 0:
+        return frame
+    share = (step - WALK_FRAMES) / WALK_FRAMES
+    width = camera.width // 4
+    left = round(share * (camera.width + width)) - width
+    body = np.s_[camera.height // 6 :, max(left, 0) : left + width]
+    depth, color = frame.depth.copy(), frame.color.copy()
+    metres = np.float32(1 + 0.5 * share)
+    hidden = (depth[body] == 0) | (depth[body] > metres)
+    depth[body] = np.where(hidden, metres, depth[body])
+    color[body] = np.where(hidden[..., None], np.uint8([40, 70, 160]), color[body])
+    return frame._replace(depth=depth, color=color)
+
+
+ALTERED = {
+    "flat": flat,
+    "along-ray": along_the_ray,
+    "whole-metres": in_whole_metres,
+    "walker": crossed,
+    "walker-left-in": crossed,
+}
 
 
 def rendered_once(synthetic: Sequence) -> Callable[[Sequence, int], Frame]:
@@ -189,6 +222,8 @@ def configuration(switch: str) -> Config:
     cfg = preset("default")
     if switch == "no-colour":
         return changed(changed(cfg, "track.corners", count=0), "track.brightness", weight=0.0)
+    if switch == "walker-left-in":
+        return changed(cfg, "track.moving", keyframes=0)
     return changed(cfg, "pairs", before=0, others=0, oldest=0) if switch == "no-pairs" else cfg
 
 

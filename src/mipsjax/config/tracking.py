@@ -179,6 +179,21 @@ class HeldConfig:
 
 
 @dataclass(frozen=True)
+class MovingConfig:
+    """Things that move are left out of tracking and of the map: what a frame shows where a keyframe looked through free
+    space. Not in the paper."""
+
+    keyframes: int = 8
+    """Nearest to the pose, by which that is told; 0 is none, and all that is seen is taken to stand still."""
+    margin: float = 0.1
+    """Metres before what a keyframe saw, beside what noise makes, from which on something was not there then."""
+    least: float = 0.02
+    """Share of a frame's depth below which it is left in."""
+    most: float = 0.5
+    """The same above which the pose is taken to be wrong instead, and nothing is left out."""
+
+
+@dataclass(frozen=True)
 class TrackConfig:
     """RO, then GO."""
 
@@ -187,6 +202,7 @@ class TrackConfig:
     corners: CornerConfig = CornerConfig()
     brightness: BrightnessConfig = BrightnessConfig()
     held: HeldConfig = HeldConfig()
+    moving: MovingConfig = MovingConfig()
     prior: float = 0.1
     """Metres (or as many rad), standard deviation of the motion that is expected: so wide that a frame follows it only
     along a direction that nothing else holds, with `lm`."""

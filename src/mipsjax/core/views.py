@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,9 @@ STEP = 2  # pixels between the neighbours from which a normal is taken: one is t
 STEADY = 64  # so many such steps make the image's width, where it matters more that a normal has little noise
 JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
 BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
+REACH = 2  # pixels around where a point falls in which nothing near it was seen, if a view saw through it: poses err
+ALLOWED = 3.0  # deviations of the depth that are no free space
+HALF = 0.5  # share of those pixels that say anything, at least
 NOISE = 2.0  # deviations of the depth by which that may be more: in the noise of 3 m no plane is that even
 
 
@@ -81,6 +85,33 @@ def observed(
         return pixel.inside & (d > 0) & (pixel.p_cam[:, 2] < d + margin)
 
     return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
+
+
+def seen_through(
+    views: Views, p_sub: Float[Array, "P 3"], camera: Intrinsics, margin: float, noise_growth: float
+) -> Bool[Array, " P"]:
+    """Which points lie where a view looked through free space: `margin` metres, and what noise makes, before all that
+    it saw in a small square around where they fall. `camera` is that of the views."""
+
+    def one(depth, T_sub_cam):
+        pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
+        nearest, measured = _square(depth)
+        free_to = nearest - margin - ALLOWED * noise_growth * nearest**2
+        clear = measured[pixel.v, pixel.u] > HALF
+        return pixel.inside & clear & (pixel.p_cam[:, 2] < free_to[pixel.v, pixel.u])
+
+    return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
+
+
+def _square(depth: Float[Array, "h w"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """The nearest depth around each pixel, infinite where there is none, and the share of pixels with depth there."""
+    side = 2 * REACH + 1
+    window = partial(
+        jax.lax.reduce_window, window_dimensions=(side, side), window_strides=(1, 1), padding="SAME"
+    )
+    exists = depth > 0
+    nearest = window(jnp.where(exists, depth, jnp.inf), jnp.inf, jax.lax.min)
+    return nearest, window(exists.astype(jnp.float32), 0.0, jax.lax.add) / side**2
 
 
 def own_normals(

@@ -19,6 +19,8 @@ class FrameInfo(NamedTuple):
     """Share of measured pixels within 5 cm of the mapped surface, before mapping."""
     confirmed: float = float("nan")
     """The same where the map is certain."""
+    moving: float = 0.0
+    """Share of the measured pixels that were left out, since they show what moves."""
     surfaces: str = ""
     """Standard deviations of the pose in the six directions that surfaces hold most to least firmly, metres or rad."""
     together: str = ""
@@ -55,6 +57,7 @@ def info_of(tracked: Tracked) -> FrameInfo:
         residual_after=float(after.residual),
         known=float(after.known),
         confirmed=float(after.confirmed),
+        moving=tracked.moving,
         surfaces=_numbers(tracked.surfaces.deviation),
         together=_numbers(together.deviation),
         free=_numbers(together.twist[-1]),

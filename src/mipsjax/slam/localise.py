@@ -90,17 +90,17 @@ def _localised(state: SlamState, frame: Frame, cfg: Config) -> tuple[SlamState, 
     if not state.located:
         return _looked_for(state, frame, NOT_FOUND_YET, None, cfg)
     tracked = track(state, frame, cfg)
-    stats = stats_of(state, frame.depth, tracked, cfg)
+    stats = stats_of(state, tracked, cfg)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         return _looked_for(state, frame, stats.said, tracked, cfg)
     info = info_of(tracked)._replace(submap=state.active, note=frame.problem)
-    record = trusted_record(frame, state, tracked, tracked.T_sub_cam, decision.status)
+    record = trusted_record(tracked.frame, state, tracked, tracked.T_sub_cam, decision.status)
     in_trouble = state.frames_in_trouble + 1 if decision.in_trouble else 0
     after = state.with_record(record)._replace(frames_in_trouble=in_trouble)
     if not decision.informative:
         return after, info._replace(note=joined_notes(info.note, few(stats.measured)))
-    after = _handed_over(moved_on(after, state, tracked, stats.residual, cfg), frame, cfg)
+    after = _handed_over(moved_on(after, state, tracked, stats.residual, cfg), tracked.frame, cfg)
     return after, info._replace(submap=after.active)
 
 

@@ -153,15 +153,16 @@ def moved_on(
     return with_corners(state, tracked.corners, tracked.found, cfg)
 
 
-def stats_of(state: SlamState, depth: np.ndarray, tracked: Tracked, cfg: Config) -> FrameStats:
+def stats_of(state: SlamState, tracked: Tracked, cfg: Config) -> FrameStats:
     """The numbers of a tracked frame by which it is decided what becomes of it."""
+    assert tracked.frame.depth is not None
     T_sub_cam, info = tracked.T_sub_cam, tracked.info
     keyframe, last = state.submap.newest, last_pose(state)
     translation, rotation = distance(keyframe.T_sub_cam, T_sub_cam)
     step_translation, step_rotation = distance(last, T_sub_cam)
     return FrameStats(
         finite=bool(info.ok),
-        measured=float(np.mean(depth > 0)),
+        measured=float(np.mean(tracked.frame.depth > 0)),
         known=float(info.after.known),
         confirmed=float(info.after.confirmed),
         open=float(tracked.together.deviation[-1]),

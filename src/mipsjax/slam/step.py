@@ -129,7 +129,7 @@ def _processed(
     if not state.located:
         return _recover(state, frame, NOT_FOUND_YET, None, cfg)
     tracked = track(state, frame, cfg)
-    stats = stats_of(state, frame.depth, tracked, cfg)
+    stats = stats_of(state, tracked, cfg)
     decision = decide(stats, cfg)
     if decision.status is Status.LOST:
         # It may be lost because the map is broken
@@ -141,7 +141,8 @@ def _processed(
         return _recover(
             with_refined(state, executor, cfg), frame, joined_notes(how, stats.said), tracked, cfg
         )
-    learned, info = _learn(state, frame, tracked, decision, cfg)
+    # Nor is what moves learned
+    learned, info = _learn(state, tracked.frame, tracked, decision, cfg)
     if decision.informative:
         learned = moved_on(learned, state, tracked, stats.residual, cfg)
     else:

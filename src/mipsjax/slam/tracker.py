@@ -14,6 +14,7 @@ from mipsjax.core.rigid import distance, from_twist, rigid, to_twist
 from mipsjax.data.sequence import Frame
 from mipsjax.images.corners import Corners
 from mipsjax.slam.landmarks import Seen, corners_of, follow_all, images_of, landmarks, placed
+from mipsjax.slam.moving import without_moving
 from mipsjax.slam.policy import converged, widening
 from mipsjax.submaps.astray import ANYWHERE
 from mipsjax.submaps.bundle import nearest, views_of
@@ -48,6 +49,8 @@ DT_RATIO_MAX = 5.0  # a gap longer than this many intervals is not extrapolated 
 class Tracked(NamedTuple):
     """What tracking says of a frame."""
 
+    frame: Frame
+    """Without depth where something moves."""
     T_sub_cam: Pose
     T_as_moved: Pose
     """Where its motion led; the pose itself but for what measurements leave loose."""
@@ -63,13 +66,25 @@ class Tracked(NamedTuple):
     doubt: Differing | None
     """How colour differs from surfaces; None where one of both does not hold the frame."""
     held: Held
-    ms: float
+    moving: float = 0.0
+    """Share of its depth that was left out."""
+    ms: float = 0.0
 
 
 def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
-    """A frame with depth, from where its corners or the motion before it say that it is."""
-    assert frame.depth is not None
+    """A frame with depth, from where its corners or the motion before it say that it is; once more, without what moves,
+    where something does."""
     began = perf_counter()
+    tracked = _tracked(state, frame, cfg)
+    still, moving = without_moving(state, frame, tracked.T_sub_cam, cfg)
+    if moving:
+        tracked = _tracked(state, still, cfg)
+    return tracked._replace(moving=moving, ms=1e3 * (perf_counter() - began))
+
+
+def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
+    """A frame of which all stands still."""
+    assert frame.depth is not None
     # Compiled code takes an image in any case; a black one that stands for none counts for nothing
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
     candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
@@ -107,6 +122,7 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     gain = gains(reference, expected, found_at, information)
     T_sub_cam, T_as_moved = _believed(found_at, T_as_before, together, gain, cfg)
     return Tracked(
+        frame,
         T_sub_cam,
         T_as_moved,
         info,
@@ -116,7 +132,6 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         together,
         differing(info.information.to_surfaces - info.information.to_colour, surfaces, colour),
         held(reference, expected, T_sub_cam, information),
-        1e3 * (perf_counter() - began),
     )
 
 
