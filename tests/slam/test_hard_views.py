@@ -165,11 +165,11 @@ def test_who_walks_through_the_view_hardly_moves_the_camera(sequence, frames, tr
     assert moving[0] == moving[1] == 0 and min(moving[8:18]) > 0.05
     assert Status.LOST not in statuses(states[-1])
     assert ate(states[-1], truth) < 2 * ate(clean[-1], truth)
-    # Nor is most of him learned, who is a fifth of the image: a part is where no keyframe saw anything before
+    # Nor is he learned, but for where no keyframe had looked before, as where he comes into view
     for keyframe in states[-1].submap.keyframes:
         behind = frames[keyframe.id].depth
         left_in = (keyframe.depth > 0) & (keyframe.depth != behind)
-        assert left_in.mean() < 0.1
+        assert keyframe.id < 12 or left_in.mean() < 0.01
 
 
 def test_where_nearly_all_moves_it_is_rather_the_pose_that_is_wrong(sequence, frames):
