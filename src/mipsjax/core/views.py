@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ STEADY = 64  # so many such steps make the image's width, where it matters more 
 JUMP = 0.05  # of the depth: neighbours farther apart are on different surfaces
 BEND = 0.005  # metres from the middle of opposite neighbours to the pixel: beyond it there is no plane
 REACH = 2  # pixels around where a point falls in which nothing near it was seen, if a view saw through it: poses err
+SIDE = 2 * REACH + 1
 ALLOWED = 3.0  # deviations of the depth that are no free space
 HALF = 0.5  # share of those pixels that say anything, at least
 NOISE = 2.0  # deviations of the depth by which that may be more: in the noise of 3 m no plane is that even
@@ -105,13 +107,22 @@ def seen_through(
 
 def _square(depth: Float[Array, "h w"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """The nearest depth around each pixel, infinite where there is none, and the share of pixels with depth there."""
-    side = 2 * REACH + 1
-    window = partial(
-        jax.lax.reduce_window, window_dimensions=(side, side), window_strides=(1, 1), padding="SAME"
-    )
     exists = depth > 0
-    nearest = window(jnp.where(exists, depth, jnp.inf), jnp.inf, jax.lax.min)
-    return nearest, window(exists.astype(jnp.float32), 0.0, jax.lax.add) / side**2
+    nearest = _around(jnp.where(exists, depth, jnp.inf), jnp.inf, jnp.minimum)
+    return nearest, _around(exists.astype(jnp.float32), 0.0, jnp.add) / SIDE**2
+
+
+def _around(
+    image: Float[Array, "h w"], beyond: float, both: Callable[[jax.Array, jax.Array], jax.Array]
+) -> Float[Array, "h w"]:
+    """All of a square around each pixel as one. Shifted images, along one axis after the other: XLA is slow on a CPU
+    where it reduces windows."""
+    for axis in (0, 1):
+        margins = [(REACH, REACH) if axis == each else (0, 0) for each in (0, 1)]
+        padded = jnp.pad(image, margins, constant_values=beyond)
+        shifted = [jax.lax.slice_in_dim(padded, i, i + image.shape[axis], axis=axis) for i in range(SIDE)]
+        image = reduce(both, shifted)
+    return image
 
 
 def own_normals(
