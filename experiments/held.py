@@ -120,7 +120,7 @@ def tasks(group: str, seeds: list[int]) -> list[Task]:
         return [Task(group, name, switch=switch, seed=seed) for name, switch, seed in switches]
     if group == "moving":
         switches = product(
-            (("small_house/living", 1), ("redkitchen", 4)), ("walker", "walker-left-in"), seeds
+            (("small_house/living", 1), ("redkitchen", 8)), ("walker", "walker-left-in"), seeds
         )
         return [Task(group, *name, switch=switch, seed=seed) for name, switch, seed in switches]
     if group == "no-pairs":
