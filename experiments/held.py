@@ -223,7 +223,7 @@ def configuration(switch: str) -> Config:
     if switch == "no-colour":
         return changed(changed(cfg, "track.corners", count=0), "track.brightness", weight=0.0)
     if switch == "walker-left-in":
-        return changed(cfg, "track.moving", keyframes=0)
+        return changed(cfg, "track.moving", most=0.0)
     return changed(cfg, "pairs", before=0, others=0, oldest=0) if switch == "no-pairs" else cfg
 
 

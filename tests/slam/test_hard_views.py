@@ -19,7 +19,8 @@ from mipsjax.data.synth.render import render
 from mipsjax.slam import step as slam
 from mipsjax.slam.finish import finish
 from mipsjax.slam.info import FrameInfo
-from mipsjax.slam.moving import without_moving
+from mipsjax.slam.moving import in_free_space, without_moving
+from mipsjax.submaps.bundle import views_of
 from mipsjax.submaps.mending import is_finite
 from mipsjax.submaps.state import SlamState, Status, trajectory
 
@@ -175,5 +176,8 @@ def test_who_walks_through_the_view_hardly_moves_the_camera(sequence, frames, tr
 def test_where_nearly_all_moves_it_is_rather_the_pose_that_is_wrong(sequence, frames):
     states, _ = run(frames[:8], sequence.intrinsics)
     [hidden] = crossed(frames[12:13], slice(0, 60), 80)
-    still, share = without_moving(states[-1], hidden, trajectory(states[-1])[-1], CFG)
+    submap, T = states[-1].submap, np.float32(trajectory(states[-1])[-1])
+    found = in_free_space(hidden, T, views_of(submap.keyframes), sequence.intrinsics, CFG)
+    assert found is not None and np.mean(found.free) > 0.5
+    still, share = without_moving(hidden, found, CFG)
     assert still is hidden and share == 0

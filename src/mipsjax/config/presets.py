@@ -19,7 +19,6 @@ from mipsjax.config.tracking import (
     CornerConfig,
     GuardConfig,
     HeldConfig,
-    MovingConfig,
     RefineConfig,
     SearchConfig,
     TrackConfig,
@@ -69,8 +68,6 @@ PAPER = Config(
         brightness=BrightnessConfig(weight=0.0),
         # How far a pose may be off is still stated; nothing follows from it
         held=HeldConfig(loose=UNLIMITED, weak=UNLIMITED, unsure=UNLIMITED),
-        # All that is seen is taken to stand still
-        moving=MovingConfig(keyframes=0),
     ),
     keyframe=KeyframeConfig(every_frames=30, translation=float("inf"), rotation=float("inf")),
     volume=VolumeConfig(governs="frustum", hysteresis=0.0, support=0, margin=0.0),

@@ -164,7 +164,6 @@ RANGES: dict[str, Range] = {
     "track.held.loose": POSITIVE,
     "track.held.weak": POSITIVE,
     "track.held.unsure": POSITIVE,
-    "track.moving.keyframes": NOT_NEGATIVE,
     "track.moving.margin": POSITIVE,
     "track.moving.least": SHARE,
     "track.moving.most": SHARE,
@@ -254,7 +253,6 @@ NOT_BELOW = (
     ("correspond.max_gradient", "correspond.min_gradient"),
     # A direction that makes a frame weak must follow the motion before, too
     ("track.held.weak", "track.held.loose"),
-    ("track.moving.most", "track.moving.least"),
 )
 """Pairs whose first field must not be below the second."""
 

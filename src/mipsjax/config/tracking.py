@@ -180,17 +180,15 @@ class HeldConfig:
 
 @dataclass(frozen=True)
 class MovingConfig:
-    """Things that move are left out of tracking and of the map: what a frame shows where a keyframe looked through free
-    space. Not in the paper."""
+    """Things that move are left out of tracking and of the map: what a frame shows where one of the `go.known` nearest
+    keyframes looked through free space. Not in the paper."""
 
-    keyframes: int = 8
-    """Nearest to the pose, by which that is told; 0 is none, and all that is seen is taken to stand still."""
     margin: float = 0.1
     """Metres before what a keyframe saw, beside what noise makes, from which on something was not there then."""
     least: float = 0.02
     """Share of a frame's depth below which it is left in."""
     most: float = 0.5
-    """The same above which the pose is taken to be wrong instead, and nothing is left out."""
+    """The same above which the pose is taken to be wrong instead, and nothing is left out. 0: nothing ever."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from mipsjax.core.rigid import distance, from_twist, rigid, to_twist
 from mipsjax.data.sequence import Frame
 from mipsjax.images.corners import Corners
 from mipsjax.slam.landmarks import Seen, corners_of, follow_all, images_of, landmarks, placed
-from mipsjax.slam.moving import without_moving
+from mipsjax.slam.moving import Found, in_free_space, without_moving
 from mipsjax.slam.policy import converged, widening
 from mipsjax.submaps.astray import ANYWHERE
 from mipsjax.submaps.bundle import nearest, views_of
@@ -75,19 +75,19 @@ def track(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     """A frame with depth, from where its corners or the motion before it say that it is; once more, without what moves,
     where something does."""
     began = perf_counter()
-    tracked = _tracked(state, frame, cfg)
-    still, moving = without_moving(state, frame, tracked.T_sub_cam, cfg)
+    tracked, found = _tracked(state, frame, cfg)
+    still, moving = without_moving(frame, found, cfg)
     if moving:
-        tracked = _tracked(state, still, cfg)
+        tracked, _ = _tracked(state, still, cfg)
     return tracked._replace(moving=moving, ms=1e3 * (perf_counter() - began))
 
 
-def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
-    """A frame of which all stands still."""
+def _tracked(state: SlamState, frame: Frame, cfg: Config) -> tuple[Tracked, Found | None]:
+    """A frame as if all stood still, and where it shows that something does not."""
     assert frame.depth is not None
     # Compiled code takes an image in any case; a black one that stands for none counts for nothing
     color = np.zeros((*frame.depth.shape, 3), np.uint8) if frame.color is None else frame.color
-    candidates, near, known = _candidates(state, frame.timestamp), _near(state, cfg), cfg.track.go.known
+    candidates, near = _candidates(state, frame.timestamp), _near(state, cfg)
     earlier = 1 + cfg.track.corners.keyframes
     trust = 0.0 if frame.color is None else trusted(state.doubts, ALLOWED_TRACKED)
     T_as_before = candidates[0]
@@ -95,6 +95,7 @@ def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     if found:
         # What was measured between two images is a better guess than that the camera has gone on as before
         candidates = [found[0].T_sub_cam, candidates[0]]
+    known = views_of(nearest(state.submap.keyframes, candidates[0], cfg.track.go.known))
     T, info = tracking.track(
         state.submap.learned.field,
         frame.depth,
@@ -108,11 +109,12 @@ def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         views_of([near[round(i)] for i in np.linspace(0, len(near) - 1, cfg.track.go.views)]),
         np.float32(converged(state.residual, cfg)),
         landmarks(found, earlier, state.camera, cfg),
-        views_of(nearest(state.submap.keyframes, candidates[0], known)) if known else None,
+        known,
         images_of([] if frame.color is None else placed(state, cfg), earlier, state.camera, cfg),
         np.float32(trust),
     )
-    # JAX computes the pose meanwhile: nothing waits for it before device_get
+    # JAX computes the pose and what moves meanwhile: nothing waits for them before device_get
+    free = in_free_space(frame, T, known, state.camera, cfg)
     corners = corners_of(frame, len(state.records), state.camera, cfg)
     T, info = jax.device_get((T, info))
     surfaces, colour = _information(info, cfg)
@@ -121,7 +123,7 @@ def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
     expected = _predicted(reference, state.records[-1], frame, found_at, cfg)
     gain = gains(reference, expected, found_at, information)
     T_sub_cam, T_as_moved = _believed(found_at, T_as_before, together, gain, cfg)
-    return Tracked(
+    tracked = Tracked(
         frame,
         T_sub_cam,
         T_as_moved,
@@ -133,6 +135,7 @@ def _tracked(state: SlamState, frame: Frame, cfg: Config) -> Tracked:
         differing(info.information.to_surfaces - info.information.to_colour, surfaces, colour),
         held(reference, expected, T_sub_cam, information),
     )
+    return tracked, free
 
 
 def coasting(state: SlamState, frame: Frame, cfg: Config) -> Held:
