@@ -42,7 +42,6 @@ def test_all_ways_to_transform_and_to_invert_agree():
         np.testing.assert_allclose(back, rigid.inverse(T), atol=EXACT)
         expected = (np.c_[POINTS, np.ones(len(POINTS))] @ T.T)[:, :3]
         np.testing.assert_allclose(rigid.transform(T, POINTS), expected, atol=EXACT)
-        np.testing.assert_allclose(rigid.transform_in_order(T, POINTS), expected, atol=EXACT)
         compiled = rigid.transform(jnp.asarray(T), jnp.asarray(POINTS))
         np.testing.assert_allclose(compiled, expected, atol=SINGLE)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mipsjax.core.camera import Intrinsics
-from mipsjax.core.rigid import align_rigid, distance, transform_in_order
+from mipsjax.core.rigid import align_rigid, distance, transform
 from mipsjax.data.open import open_sequence
 from mipsjax.images.features import LARGEST, UNIT, Features, detect, packed
 from mipsjax.loops import ransac
@@ -135,9 +135,7 @@ def test_jacobian_is_the_derivative():
         for sign, M in zip((1, -1), moved, strict=True):
             M[:3, :3] = Rotation.from_rotvec(sign * twist[3:]).as_matrix() @ T[:3, :3]
             M[:3, 3] += sign * twist[:3]
-        ahead, back = (
-            ransac._residuals(transform_in_order(M, pairs.p_current), pairs.p_other) for M in moved
-        )
+        ahead, back = (ransac._residuals(transform(M, pairs.p_current), pairs.p_other) for M in moved)
         # residuals of order 100 per unit, central differences: relative error 1e-8 or so
         np.testing.assert_allclose(
             ransac._jacobian(pairs, T)[..., axis], (ahead - back) / (2 * step), atol=1e-4

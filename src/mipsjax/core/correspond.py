@@ -21,7 +21,7 @@ from mipsjax.config.sections import Config
 from mipsjax.core import field as nf
 from mipsjax.core.compiled import compiled
 from mipsjax.core.evidence import SATURATED
-from mipsjax.core.rigid import transform, transform_back
+from mipsjax.core.rigid import transform, transform_back, turned
 
 
 class Surface(NamedTuple):
@@ -94,7 +94,7 @@ def match(field_k: nf.Field, T_k_j: Float[Array, "4 4"], surface_j: Surface, cfg
     )
     q_k = _descend(field_k, start, cfg.correspond.match_steps, cfg)
     after = _local(field_k, q_k, cfg)
-    normal_j = surface_j.normals @ T_k_j[:3, :3].T
+    normal_j = turned(T_k_j[:3, :3], surface_j.normals)
     # The two sides of a thin wall are within the truncation of each other: only the normals tell them apart
     agree = jnp.sum(normal_j * _unit(after.gradient), -1) > np.cos(cfg.correspond.max_angle)
     distance = jnp.sqrt(jnp.sum((q_k - start) ** 2, -1))

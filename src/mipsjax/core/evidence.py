@@ -19,7 +19,7 @@ from mipsjax.core import losses, sampling
 from mipsjax.core.camera import Intrinsics
 from mipsjax.core.equations import Points, Prior, Rows, System, precisions, robust_cost
 from mipsjax.core.photometric import Shades, brightness_system
-from mipsjax.core.rigid import transform, transform_back
+from mipsjax.core.rigid import transform, transform_back, turned
 from mipsjax.core.views import PlaneErrors, Views, plane_errors
 
 SATURATED = 0.95  # of the truncation: beyond it the field is flat and says nothing about direction
@@ -167,7 +167,7 @@ def landmark_system(T: Float[Array, "4 4"], landmarks: Landmarks, camera: Intrin
 
 def _jacobian(T: Float[Array, "4 4"], points: Points, gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:
     """Of distances with this gradient in the submap's frame."""
-    return by_twist(points.p_cam, gradient @ T[:3, :3])
+    return by_twist(points.p_cam, turned(T[:3, :3].T, gradient))
 
 
 def by_twist(p_cam: Float[Array, "P 3"], gradient: Float[Array, "P 3"]) -> Float[Array, "P 6"]:

@@ -16,7 +16,7 @@ from mipsjax.config.sections import Config
 from mipsjax.core import losses
 from mipsjax.core.camera import Intrinsics, grid_shape, project, unproject
 from mipsjax.core.equations import Rows, System
-from mipsjax.core.rigid import transform, transform_back
+from mipsjax.core.rigid import transform, transform_back, turned
 from mipsjax.core.sampling import NEAR
 from mipsjax.core.views import JUMP
 
@@ -218,7 +218,7 @@ def _compared(T: Float[Array, "4 4"], seen: Shades, camera: Intrinsics, cfg: Con
         by_u, by_v = there[:, 1] * small.fx / z, there[:, 2] * small.fy / z
         # Derivatives of the pinhole projection: u moves by fx / z along x, and by -fx x / z^2 along z
         by_ref = jnp.stack([by_u, by_v, -(by_u * p_ref[:, 0] + by_v * p_ref[:, 1]) / z], -1)
-        by_cam = by_ref @ R_sub_ref.T @ T[:3, :3]
+        by_cam = turned(T[:3, :3].T, turned(R_sub_ref, by_ref))
         jacobian = jnp.concatenate([by_cam, jnp.cross(p_cam, by_cam)], -1)
         # A point whose depth is wrong is looked for beside its place, and is as much brighter there
         by_depth = cfg.sensor.noise_floor * jnp.sum(by_cam * p_cam, -1) / jnp.maximum(p_cam[:, 2], NEAR)

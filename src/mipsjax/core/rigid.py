@@ -1,7 +1,7 @@
 """Rigid motions: poses as 4 x 4 matrices, small motions as twists (v, omega), metres and radians.
 
-`T_a_b` maps b-coordinates to a. `transform` and `transform_back` take NumPy arrays and JAX arrays alike. What follows
-them is for the host, in double precision; `exp`, `log` and `perturbed` at the end are for compiled code.
+`T_a_b` maps b-coordinates to a. `transform`, `transform_back` and `turned` take NumPy arrays and JAX arrays alike. What
+follows them is for the host, in double precision; `exp`, `log` and `perturbed` at the end are for compiled code.
 
 Where two ways of computing the same differ in the last bit, both are here, each with the reason why it is wanted. A
 pose that `np.linalg.inv` inverts elsewhere is a third way of `inverse`: it solves a system and rounds otherwise.
@@ -23,25 +23,25 @@ AnyArray = TypeVar("AnyArray", np.ndarray, jax.Array)
 
 
 def transform(T_a_b: Float[AnyArray, "4 4"], p_b: Float[AnyArray, "P 3"]) -> Float[AnyArray, "P 3"]:
-    """Points from frame b to frame a.
-
-    By the rotation matrix: through quaternions, as a library of Lie groups would do it, takes many times as long.
-    """
-    return p_b @ T_a_b[:3, :3].T + T_a_b[None, :3, 3]
+    """Points from frame b to frame a."""
+    return turned(T_a_b[:3, :3], p_b) + T_a_b[None, :3, 3]
 
 
 def transform_back(T_a_b: Float[AnyArray, "4 4"], p_a: Float[AnyArray, "P 3"]) -> Float[AnyArray, "P 3"]:
     """Points from frame a to frame b: the shift is undone first, so that no pose has to be inverted."""
-    return (p_a - T_a_b[None, :3, 3]) @ T_a_b[:3, :3]
+    return turned(T_a_b[:3, :3].T, p_a - T_a_b[None, :3, 3])
 
 
-def transform_in_order(T_a_b: Pose, p_b: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
-    """`transform` on the host, each sum in one and the same order.
+def turned(R_a_b: Float[AnyArray, "3 3"], v_b: Float[AnyArray, "P 3"]) -> Float[AnyArray, "P 3"]:
+    """Directions from frame b to frame a.
 
-    The order of a matrix product's sums may depend on the number of points and of threads, that of einsum does not:
-    what is decided by thresholds on single points comes out the same on every machine.
+    By the rotation matrix: through quaternions, as a library of Lie groups would do it, takes many times as long. As
+    sums: of a matrix product for each of many poses, as `jax.vmap` makes it, XLA takes 16 times as long on a CPU. On
+    the host, too: the order of a product's sums may depend on the number of points and of threads, and what is decided
+    by thresholds on single points is to come out the same on every machine.
     """
-    return np.einsum("ij,mj->mi", T_a_b[:3, :3], p_b.astype(np.float64)) + T_a_b[None, :3, 3]
+    x, y, z = v_b[:, 0:1], v_b[:, 1:2], v_b[:, 2:3]
+    return x * R_a_b[None, :, 0] + y * R_a_b[None, :, 1] + z * R_a_b[None, :, 2]
 
 
 def from_parts(rotation: Float64[np.ndarray, "3 3"], translation: Float64[np.ndarray, "3"]) -> Pose:

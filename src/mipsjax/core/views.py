@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mipsjax.core.camera import Intrinsics, project, unproject
-from mipsjax.core.rigid import transform_back
+from mipsjax.core.rigid import transform_back, turned
 
 STEP = 2  # pixels between the neighbours from which a normal is taken: one is too noisy
 STEADY = 64  # so many such steps make the image's width, where it matters more that a normal has little noise
@@ -69,7 +69,7 @@ def plane_errors(
         planes = planes_at(depth, pixel.v, pixel.u, camera, noise_growth)
         distance = jnp.sum((pixel.p_cam - planes.point) * planes.normal, -1)
         mask = pixel.inside & planes.flat & (jnp.abs(distance) < reach)
-        return PlaneErrors(jnp.where(mask, distance, 0.0), planes.normal @ T_sub_cam[:3, :3].T, mask)
+        return PlaneErrors(jnp.where(mask, distance, 0.0), turned(T_sub_cam[:3, :3], planes.normal), mask)
 
     return jax.vmap(one)(views.depth, views.T_sub_cam)
 
@@ -99,8 +99,8 @@ def seen_through(
         pixel = _pixels(p_sub, T_sub_cam, depth.shape, camera)
         nearest, measured = _square(depth)
         free_to = nearest - margin - ALLOWED * noise_growth * nearest**2
-        clear = measured[pixel.v, pixel.u] > HALF
-        return pixel.inside & clear & (pixel.p_cam[:, 2] < free_to[pixel.v, pixel.u])
+        free_to = jnp.where(measured > HALF, free_to, -jnp.inf)
+        return pixel.inside & (pixel.p_cam[:, 2] < free_to[pixel.v, pixel.u])
 
     return jnp.any(jax.vmap(one)(views.depth, views.T_sub_cam), 0)
 

@@ -4,8 +4,8 @@ Triples of matched points give hypotheses (RANSAC, Fischler and Bolles 1981). Th
 depth camera measures well, directions in the image, and by depth only as far as its noise allows: distances between
 points alone lose half of the pairs at 4 m. Residuals are divided by the deviations below.
 
-Sums are written as einsum: unlike those of a matrix product, their order depends on no number of threads. So are those
-of `transform_in_order`, by which points are moved here.
+Sums are written as einsum, and points are moved by `transform`: unlike that of a matrix product, the order of such sums
+depends on no number of threads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from mipsjax.core.rigid import Pose, from_parts, rotation, transform_in_order
+from mipsjax.core.rigid import Pose, from_parts, rotation, transform
 
 DIRECTION_NOISE = 0.005
 """Of a matched keypoint, radians: 1.5 pixels of a 320 pixel image."""
@@ -59,7 +59,7 @@ def ransac(pairs: Pairs, seed: int) -> Pose | None:
     if not plausible.any():
         return None
     T = _from_triples(a[plausible], b[plausible])
-    # All points by all hypotheses at once; for one motion this is `transform_in_order`
+    # All points by all hypotheses at once; for one motion this is `transform`
     moved = np.einsum("nij,mj->nmi", T[:, :3, :3], pairs.p_current) + T[:, None, :3, 3]
     cost = np.sum(_residuals(moved, pairs.p_other[None]) ** 2, axis=-1)
     # Truncated squares and not a count of inliers: among equal counts the closer fit wins
@@ -75,7 +75,7 @@ def by_inliers(pairs: Pairs, T_other_current: Pose) -> tuple[Pose, Bool[np.ndarr
         if inlier.sum() < 3:
             break
         kept = Pairs(*(p[inlier] for p in pairs))
-        residual = _residuals(transform_in_order(T, kept.p_current), kept.p_other)
+        residual = _residuals(transform(T, kept.p_current), kept.p_other)
         # Cauchy's, on the mean of three residuals, each in deviations
         weight = 1 / (1 + np.mean(residual**2, axis=1))
         J = _jacobian(kept, T)
@@ -155,5 +155,5 @@ def _jacobian(pairs: Pairs, T: Pose) -> Float64[np.ndarray, "M 3 6"]:
 
 
 def _fits(pairs: Pairs, T: Pose) -> Bool[np.ndarray, "M"]:
-    moved = transform_in_order(T, pairs.p_current)
+    moved = transform(T, pairs.p_current)
     return (np.sum(_residuals(moved, pairs.p_other) ** 2, axis=1) < GATE) & (moved[:, 2] > NEAREST_M)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mipsjax.core.camera import Intrinsics, unproject
-from mipsjax.core.rigid import Pose, transform_in_order
+from mipsjax.core.rigid import Pose, transform
 from mipsjax.images.features import Features, coarse_stride, squared_distances
 from mipsjax.loops import ransac
 from mipsjax.loops.ransac import LEAST_SIDE_M, NEAREST_M, Pairs, depth_noise, direction
@@ -71,7 +71,7 @@ def relative_pose(current: Features, other: Features, camera: Intrinsics, seed: 
     if not inlier.any():
         return _nothing(len(pairs.p_current))
     kept = Pairs(*(p[inlier] for p in pairs))
-    distance = np.linalg.norm(transform_in_order(T, kept.p_current) - kept.p_other, axis=1)
+    distance = np.linalg.norm(transform(T, kept.p_current) - kept.p_other, axis=1)
     deviation_m, deviation_rad = ransac.deviation(kept, T)
     agreement, coverage = depth_agreement(current, other, T, camera)
     ok = (
@@ -98,7 +98,7 @@ def match_all(current: Features, other: Features) -> Int[np.ndarray, "M 2"]:
 
 def match_near(current: Features, other: Features, T_other_current: Pose) -> Int[np.ndarray, "M 2"]:
     """The same among features that a motion brings close to each other; looks then need not be unique."""
-    moved = transform_in_order(T_other_current, current.p_cam)
+    moved = transform(T_other_current, current.p_cam)
     target = other.p_cam.astype(np.float64)
     # For small angles a difference of directions at focal length 1 is the angle between them
     angle = np.linalg.norm(direction(moved)[:, None] - direction(target)[None], axis=2)
@@ -129,7 +129,7 @@ def _compare(
     """Numbers of depths that agree with `seen`, that stand where it saw through, and of all."""
     v, u = np.nonzero(depth > 0)
     d = depth[v, u].astype(np.float64)
-    moved = transform_in_order(T_seen_depth, unproject(v, u, d, camera))
+    moved = transform(T_seen_depth, unproject(v, u, d, camera))
     moved = moved[moved[:, 2] > NEAREST_M]
     # By the direction, as everywhere in this room: `project` divides last and rounds otherwise
     at = np.rint(direction(moved) * [camera.fx, camera.fy] + [camera.cx, camera.cy])
