@@ -3,10 +3,10 @@
     python experiments/kills.py [SEQUENCE] [--kills 20] [--seed 0] [--options ...]
 
 The first run is not killed, and says how long it takes. Then runs are ended by SIGKILL after random times, `--kills`
-times in all, and each is resumed from its last checkpoint until it comes to its end; the next one then begins. Writes
-`experiments/out/kills.csv`: a row a kill, after how many seconds it came and how large the newest checkpoint was, and a
-row for each run that came to its end, whether trajectory, mesh and loops are the same to the byte. Exits with 1 where
-one is not.
+times in all, and each is resumed from its last checkpoint, or begun anew where there is none yet, until it comes to its
+end; the next one then begins. Writes `experiments/out/kills.csv`: a row a kill, after how many seconds it came and how
+large the newest checkpoint was, and a row for each run that came to its end, whether trajectory, mesh and loops are the
+same to the byte. Exits with 1 where one is not.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def main() -> None:
                 kills += 1
                 name, size = newest_checkpoint(broken)
                 rows.append({"kill": kills, "after_s": after_s, "checkpoint": name, "bytes": size})
-                # Killed before it had a folder, it is begun anew, as a user would
-                arguments = ["--resume", str(broken)] if (broken / "config.json").exists() else fresh
+                # Killed before it had a checkpoint, it is begun anew, as `--resume` says
+                arguments = ["--resume", str(broken)] if name else fresh
             else:
                 same = all((whole / name).read_bytes() == (broken / name).read_bytes() for name in COMPARED)
                 rows.append({"kill": "", "after_s": after_s, "same": same})

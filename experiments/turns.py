@@ -1,11 +1,13 @@
 """What a change costs: two checkouts on one sequence, a few frames of each in turn.
 
-    python experiments/turns.py BEFORE AFTER SEQUENCE [--frames 400] [--block 4]
+    python experiments/turns.py BEFORE AFTER SEQUENCE [--frames 100] [--block 4] [--pairs 6]
 
 BEFORE and AFTER are folders of checkouts. Each works in a process of its own, which waits while the other one works, so
 that a machine whose speed changes from minute to minute is as fast for both. Default preset; the first frames, in which
-programs are compiled, are left out, and so is what follows the last frame. Writes `turns.csv`, milliseconds a frame for
-each block, and prints what both take in the mean and how the frames a second of AFTER relate to those of BEFORE.
+programs are compiled, are left out, and so is what follows the last frame. Two processes of one program may differ by
+some percent all along, so there are several pairs, each of new processes. Writes `turns.csv`, milliseconds a frame for
+each block, and prints what both take in the mean and how the frames a second of AFTER relate to those of BEFORE, with
+the range of that over the pairs.
 """
 
 from __future__ import annotations
@@ -90,8 +92,9 @@ def main() -> None:
     parser.add_argument("before", type=Path, nargs="?")
     parser.add_argument("after", type=Path, nargs="?")
     parser.add_argument("sequence", nargs="?")
-    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--block", type=int, default=4)
+    parser.add_argument("--pairs", type=int, default=6)
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
@@ -101,19 +104,36 @@ def main() -> None:
         parser.error("give two checkouts and a sequence")
     from common import write_rows
 
+    pairs = [pair(options) for _ in range(options.pairs)]
+    write_rows(
+        "turns",
+        [
+            {"pair": number, **dict(zip(NAMES, row, strict=True))}
+            for number, found in enumerate(pairs)
+            for row in found.tolist()
+        ],
+    )
+    for name, means in zip(NAMES, np.array([found.mean(0) for found in pairs]).T, strict=True):
+        print(f"{name}: {means.mean():.1f} ms a frame in the mean, {means.min():.1f} to {means.max():.1f}")
+    ratios = [found[:, 0].mean() / found[:, 1].mean() for found in pairs]
+    print(
+        f"frames a second: {np.exp(np.mean(np.log(ratios))):.3f} of before in the mean of {len(ratios)} pairs, "
+        f"{min(ratios):.3f} to {max(ratios):.3f}"
+    )
+
+
+def pair(options: argparse.Namespace) -> np.ndarray:
+    """Milliseconds a frame of each block, of two new processes."""
     processes = [
         worker(checkout, options.sequence, options.frames, options.block)
         for checkout in (options.before, options.after)
     ]
-    found = measured(processes, options.block)
-    write_rows("turns", [dict(zip(NAMES, row, strict=True)) for row in found.tolist()])
-    for name, column in zip(NAMES, found.T, strict=True):
-        print(f"{name}: {column.mean():.1f} ms a frame in the mean, {np.median(column):.1f} in the median")
-    before, after = found.T
-    print(
-        f"frames a second: {before.mean() / after.mean():.3f} of before by the means, "
-        f"{np.median(before / after):.3f} in the median of {len(found)} blocks"
-    )
+    try:
+        return measured(processes, options.block)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 if __name__ == "__main__":
